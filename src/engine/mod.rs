@@ -1,0 +1,36 @@
+//! The engine decides. Nothing here waits, asks the time or opens anything: if something must
+//! happen later, a function returns the time at which to be called.
+//!
+//! The modules stand in the order of the data's way, and each uses only modules above it
+//! (`tests/architecture` holds this).
+
+// Words that everything speaks.
+pub mod address;
+pub mod time;
+pub mod value;
+
+// Describe: what a device is, what the gateway shall do.
+pub mod configuration;
+pub mod device;
+pub mod profile;
+pub mod settings;
+pub mod yaml;
+
+// Ask: requests, replies, and which come when.
+pub mod modbus;
+pub mod plan;
+pub mod schedule;
+
+// Understand: words to readings, and what changed.
+pub mod codec;
+pub mod state;
+
+// Tell: topics, discovery, health, and what waits for the broker.
+pub mod health;
+pub mod homeassistant;
+pub mod outbox;
+pub mod topics;
+
+// Obey: commands, and the bus that ties all of it together.
+pub mod bus;
+pub mod command;

@@ -1,0 +1,184 @@
+//! Modbus as data: what is asked, what comes back, and what can go wrong.
+//!
+//! `pdu` turns calls into bytes and bytes into answers; `rtu` is the guard of a serial line, an
+//! automaton fed with bytes and times that never takes a reply for another's; `tcp` is the same
+//! door for Modbus TCP.
+
+pub mod pdu;
+pub mod rtu;
+pub mod tcp;
+
+use std::fmt;
+
+use crate::engine::address::Span;
+use crate::engine::time::Time;
+
+/// One question to one unit.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Request {
+    /// 1 to 247; 0 is a broadcast on a serial line, and an ordinary unit on Modbus TCP.
+    pub unit: u8,
+    pub call: Call,
+}
+
+/// What is asked, by function code.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Call {
+    /// Function 1, 2, 3 or 4, by the span's table.
+    Read(Span),
+    /// Function 5.
+    WriteCoil { address: u16, on: bool },
+    /// Function 6.
+    WriteRegister { address: u16, word: u16 },
+    /// Function 15.
+    WriteCoils { address: u16, values: Vec<bool> },
+    /// Function 16.
+    WriteRegisters { address: u16, words: Vec<u16> },
+    /// Function 8: a sub-function and its data.
+    Diagnostics { function: u16, data: Vec<u16> },
+    /// Function 43/14: `code` 1 basic, 2 regular, 3 extended, 4 one object.
+    ReadIdentification { code: u8, object: u8 },
+    /// Function 17.
+    ReportServerId,
+}
+
+impl Call {
+    pub const fn function(&self) -> u8 {
+        match self {
+            Call::Read(span) => span.table().read_function(),
+            Call::WriteCoil { .. } => 5,
+            Call::WriteRegister { .. } => 6,
+            Call::Diagnostics { .. } => 8,
+            Call::WriteCoils { .. } => 15,
+            Call::WriteRegisters { .. } => 16,
+            Call::ReportServerId => 17,
+            Call::ReadIdentification { .. } => 43,
+        }
+    }
+
+    pub const fn is_write(&self) -> bool {
+        matches!(self.function(), 5 | 6 | 15 | 16)
+    }
+}
+
+impl fmt::Display for Call {
+    /// As in a transcript: `read input 0..7`, `write coil 3 ON`, `write holding 16 0087`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Call::Read(span) => write!(f, "read {span}"),
+            Call::WriteCoil { address, on } => {
+                write!(f, "write coil {address} {}", if *on { "ON" } else { "OFF" })
+            }
+            Call::WriteRegister { address, word } => write!(f, "write holding {address} {word:04X}"),
+            Call::WriteCoils { address, values } => {
+                write!(f, "write coils {address}")?;
+                values.iter().try_for_each(|on| write!(f, " {}", if *on { "ON" } else { "OFF" }))
+            }
+            Call::WriteRegisters { address, words } => {
+                write!(f, "write holdings {address}")?;
+                words.iter().try_for_each(|word| write!(f, " {word:04X}"))
+            }
+            Call::Diagnostics { function, data } => {
+                write!(f, "diagnostics {function}")?;
+                data.iter().try_for_each(|word| write!(f, " {word:04X}"))
+            }
+            Call::ReadIdentification { code, object } => write!(f, "identification {code} {object}"),
+            Call::ReportServerId => write!(f, "report server id"),
+        }
+    }
+}
+
+/// What a device said, checked against what it was asked: a read of eight registers is answered by
+/// exactly eight.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Answer {
+    Bits(Vec<bool>),
+    Words(Vec<u16>),
+    /// The write was confirmed (or, for a broadcast, sent).
+    Written,
+    Diagnostics(Vec<u16>),
+    Identification(Identification),
+    ServerId(Vec<u8>),
+}
+
+/// The answer to function 43/14.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Identification {
+    pub conformity: u8,
+    /// The object to ask next, if more follow.
+    pub next: Option<u8>,
+    /// Object number and its text, any bytes outside UTF-8 replaced.
+    pub objects: Vec<(u8, String)>,
+}
+
+/// Why there is no answer. The three groups send a person to three places: to the device
+/// (exception), to its address and wiring (silence), to the line's quality (checksum, frame).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum RequestError {
+    /// The device refused, with this exception code.
+    Exception(u8),
+    /// Nothing that fits came in time.
+    Timeout,
+    /// Bytes came, but with a wrong checksum.
+    Checksum,
+    /// A whole and valid frame came, and nothing better: another unit's, another function's, a wrong
+    /// length, a wrong echo.
+    WrongFrame,
+    /// The port or the connection broke.
+    Link(String),
+}
+
+impl fmt::Display for RequestError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            RequestError::Exception(code) => write!(f, "exception {code} ({})", exception_name(*code)),
+            RequestError::Timeout => write!(f, "no answer in time"),
+            RequestError::Checksum => write!(f, "checksum error"),
+            RequestError::WrongFrame => write!(f, "an answer that does not fit the request"),
+            RequestError::Link(reason) => write!(f, "link: {reason}"),
+        }
+    }
+}
+
+/// The specification's words for an exception code.
+pub const fn exception_name(code: u8) -> &'static str {
+    match code {
+        1 => "illegal function",
+        2 => "illegal data address",
+        3 => "illegal data value",
+        4 => "device failure",
+        5 => "acknowledge",
+        6 => "device busy",
+        8 => "memory parity error",
+        10 => "gateway path unavailable",
+        11 => "gateway target failed to respond",
+        _ => "unknown exception",
+    }
+}
+
+/// What the line did with one request, and when.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Reply {
+    pub result: Result<Answer, RequestError>,
+    /// When its first byte was handed to the line.
+    pub sent_at: Time,
+    pub first_byte_at: Option<Time>,
+    pub last_byte_at: Option<Time>,
+    /// What was thrown away on the way to this reply.
+    pub discarded: Discarded,
+}
+
+/// Counts of what a line threw away; each is a hint at a different fault.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Discarded {
+    /// Bytes that belonged to no frame.
+    pub noise_bytes: u32,
+    /// Whole frames that came after their request had timed out.
+    pub late_replies: u32,
+    /// Whole frames from other units or to other requests.
+    pub foreign_frames: u32,
+    /// Copies of our own request, as adapters without echo suppression return them.
+    pub echoes: u32,
+    /// Frames with a wrong checksum.
+    pub checksum_errors: u32,
+}

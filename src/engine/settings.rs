@@ -1,0 +1,146 @@
+//! What the owner wants: broker, buses, devices. Resolved and checked; the file's shape is
+//! `configuration::file`.
+
+use std::path::PathBuf;
+
+use crate::engine::device::Device;
+use crate::engine::time::Duration;
+
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    pub mqtt: Mqtt,
+    pub home_assistant: HomeAssistant,
+    pub http: Http,
+    pub state_dir: PathBuf,
+    /// An unchanged value is told again after this.
+    pub republish: Duration,
+    pub on_broker_loss: OnBrokerLoss,
+    pub buses: Vec<Bus>,
+    pub devices: Vec<DeviceSettings>,
+}
+
+#[derive(Clone, PartialEq, Eq)]
+pub struct Mqtt {
+    pub host: String,
+    pub port: u16,
+    pub tls: bool,
+    pub username: Option<String>,
+    pub password: Password,
+    /// One per gateway where several share a broker.
+    pub base_topic: String,
+}
+
+impl std::fmt::Debug for Mqtt {
+    /// Tells everything but the password.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Mqtt({}:{}, base topic {})", self.host, self.port, self.base_topic)
+    }
+}
+
+/// Where the broker's password comes from; the edge reads the file.
+#[derive(Clone, PartialEq, Eq)]
+pub enum Password {
+    None,
+    Given(String),
+    File(PathBuf),
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HomeAssistant {
+    pub discovery: bool,
+    /// `homeassistant`
+    pub prefix: String,
+    /// `homeassistant/status`
+    pub status_topic: String,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Http {
+    /// `host:port`; `None`: no HTTP.
+    pub listen: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OnBrokerLoss {
+    /// Go on polling, so that devices' watchdogs stay fed.
+    Keep,
+    /// Stop talking to devices that have a watchdog, so that their outputs fall to the safe state.
+    StopFeeding,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub struct Bus {
+    pub name: String,
+    pub link: Link,
+    /// How long a reply may be late before the request counts as unanswered.
+    pub response_timeout: Duration,
+    /// Silence before each request; `None`: 3.5 characters, 1.75 ms above 19200 baud.
+    pub gap: Option<Duration>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Link {
+    /// Modbus RTU on a serial port.
+    Serial { path: String, line: Line },
+    /// Modbus TCP.
+    Tcp { host: String, port: u16 },
+    /// RTU frames over a TCP connection to a serial server, whose line runs at `line`.
+    RtuOverTcp { host: String, port: u16, line: Line },
+}
+
+/// The characters on a serial line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Line {
+    /// Bits a second.
+    pub baud: u32,
+    pub parity: Parity,
+    /// 1 or 2.
+    pub stop_bits: u8,
+}
+
+impl Line {
+    /// Start bit, eight data bits, parity, stop bits: 10 to 12.
+    pub const fn bits_per_character(self) -> u32 {
+        let parity = match self.parity {
+            Parity::None => 0,
+            Parity::Even | Parity::Odd => 1,
+        };
+        9 + parity + self.stop_bits as u32
+    }
+
+    /// How long `count` characters take on the wire.
+    pub fn characters(self, count: u32) -> Duration {
+        let nanos = u64::from(count) * u64::from(self.bits_per_character()) * 1_000_000_000;
+        Duration::from_nanos(nanos / u64::from(self.baud))
+    }
+
+    /// The silence between two frames: 3.5 characters, and 1.75 ms above 19200 baud (Modbus over
+    /// serial line specification V1.02, 2.5.1.1).
+    pub fn frame_gap(self) -> Duration {
+        if self.baud > 19_200 {
+            return Duration::from_micros(1750);
+        }
+        self.characters(7) / 2
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Parity {
+    None,
+    Even,
+    Odd,
+}
+
+/// One device on one bus.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DeviceSettings {
+    /// The key in the configuration: topics and identifiers are made of it.
+    pub name: String,
+    /// What people call it.
+    pub title: String,
+    /// Index into [`Settings::buses`].
+    pub bus: usize,
+    pub unit: u8,
+    /// The profile with this device's own wishes applied.
+    pub device: Device,
+}

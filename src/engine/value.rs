@@ -1,0 +1,240 @@
+//! What a reading is: a number, a flag, a name, a text, or missing with a reason.
+
+use std::fmt;
+
+/// An exact decimal number: `units` × 10^-`decimals`. `21.50` is 2150 with 2 decimals, and keeps
+/// its last zero: the digits are those that the register's scale gives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Decimal {
+    pub units: i128,
+    pub decimals: u8,
+}
+
+impl Decimal {
+    pub const ZERO: Decimal = Decimal { units: 0, decimals: 0 };
+    pub const ONE: Decimal = Decimal { units: 1, decimals: 0 };
+    /// More digits behind the dot than this are refused when parsing.
+    pub const DECIMALS_MAX: u8 = 18;
+
+    pub const fn integer(units: i128) -> Decimal {
+        Decimal { units, decimals: 0 }
+    }
+
+    /// Reads `21.5`, `-0.3`, `20`, `1e-05`, `+7`. `None` for anything else, for more than 30 digits
+    /// and for more than [`Decimal::DECIMALS_MAX`] decimals.
+    pub fn parse(text: &str) -> Option<Decimal> {
+        let (mantissa, exponent) = match text.find(['e', 'E']) {
+            Some(at) => (&text[..at], text[at + 1..].parse::<i32>().ok()?),
+            None => (text, 0),
+        };
+        let (negative, digits) = match mantissa.as_bytes().first()? {
+            b'-' => (true, &mantissa[1..]),
+            b'+' => (false, &mantissa[1..]),
+            _ => (false, mantissa),
+        };
+        let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
+        let all_digits = |part: &str| part.bytes().all(|byte| byte.is_ascii_digit());
+        if whole.len() + fraction.len() == 0 || !all_digits(whole) || !all_digits(fraction) {
+            return None;
+        }
+        if whole.len() + fraction.len() > 30 || !(-40..=30).contains(&exponent) {
+            return None;
+        }
+        let mut units: i128 = format!("{whole}{fraction}").parse().ok()?;
+        let mut decimals = fraction.len() as i32 - exponent;
+        while decimals < 0 {
+            units = units.checked_mul(10)?;
+            decimals += 1;
+        }
+        while decimals > i32::from(Decimal::DECIMALS_MAX) && units % 10 == 0 {
+            units /= 10;
+            decimals -= 1;
+        }
+        if decimals > i32::from(Decimal::DECIMALS_MAX) {
+            return None;
+        }
+        Some(Decimal { units: if negative { -units } else { units }, decimals: decimals as u8 })
+    }
+
+    /// The same number with exactly `decimals` digits behind the dot; `None` if that would lose
+    /// a digit or overflow.
+    pub fn with_decimals(self, decimals: u8) -> Option<Decimal> {
+        let units = if decimals >= self.decimals {
+            self.units.checked_mul(power_of_ten(decimals - self.decimals)?)?
+        } else {
+            let divisor = power_of_ten(self.decimals - decimals)?;
+            if self.units % divisor != 0 {
+                return None;
+            }
+            self.units / divisor
+        };
+        Some(Decimal { units, decimals })
+    }
+
+    /// The same number without trailing zeros behind the dot.
+    pub fn normalized(mut self) -> Decimal {
+        while self.decimals > 0 && self.units % 10 == 0 {
+            self.units /= 10;
+            self.decimals -= 1;
+        }
+        self
+    }
+
+    pub fn checked_mul(self, other: Decimal) -> Option<Decimal> {
+        Some(Decimal {
+            units: self.units.checked_mul(other.units)?,
+            decimals: self.decimals.checked_add(other.decimals)?,
+        })
+    }
+
+    pub fn checked_add(self, other: Decimal) -> Option<Decimal> {
+        let decimals = self.decimals.max(other.decimals);
+        let (a, b) = (self.with_decimals(decimals)?, other.with_decimals(decimals)?);
+        Some(Decimal { units: a.units.checked_add(b.units)?, decimals })
+    }
+
+    pub fn negated(self) -> Decimal {
+        Decimal { units: -self.units, ..self }
+    }
+
+    /// `self ÷ divisor` as a whole number, only if nothing is left over.
+    pub fn divided_exactly_by(self, divisor: Decimal) -> Option<i128> {
+        let decimals = self.decimals.max(divisor.decimals);
+        let (a, b) = (self.with_decimals(decimals)?, divisor.with_decimals(decimals)?);
+        if b.units == 0 || a.units % b.units != 0 { None } else { Some(a.units / b.units) }
+    }
+
+    /// Compares by amount: 1.0 equals 1.
+    pub fn compare(self, other: Decimal) -> std::cmp::Ordering {
+        let decimals = self.decimals.max(other.decimals);
+        match (self.with_decimals(decimals), other.with_decimals(decimals)) {
+            (Some(a), Some(b)) => a.units.cmp(&b.units),
+            _ => self.to_f64().total_cmp(&other.to_f64()),
+        }
+    }
+
+    pub fn to_f64(self) -> f64 {
+        // Through text: the nearest double, not a rounded quotient of two.
+        self.to_string().parse().unwrap_or(f64::NAN)
+    }
+}
+
+fn power_of_ten(exponent: u8) -> Option<i128> {
+    10i128.checked_pow(u32::from(exponent))
+}
+
+impl fmt::Display for Decimal {
+    /// Digits, a dot, no exponent: `-0.050`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let sign = if self.units < 0 { "-" } else { "" };
+        let digits = self.units.unsigned_abs().to_string();
+        let decimals = usize::from(self.decimals);
+        if decimals == 0 {
+            return write!(f, "{sign}{digits}");
+        }
+        let padded = format!("{digits:0>width$}", width = decimals + 1);
+        let (whole, fraction) = padded.split_at(padded.len() - decimals);
+        write!(f, "{sign}{whole}.{fraction}")
+    }
+}
+
+/// What is known of a point.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Reading {
+    /// From integer registers: exact.
+    Number(Decimal),
+    /// From floating-point registers; always finite.
+    Float(f64),
+    Flag(bool),
+    /// A named value: `automatic`, `°C`.
+    Name(String),
+    Text(String),
+    Missing(Missing),
+}
+
+/// Why there is no value. Published as `None`; the reason goes to the device's info.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Missing {
+    /// Not read since the start, or since the last write.
+    NotYetRead,
+    /// The device does not answer.
+    Offline,
+    /// The named point decides how to read this one, and is itself not known yet.
+    WaitingFor(String),
+    /// In the present mode the device has no such reading.
+    NotInThisMode,
+    /// The register held one of the profile's `invalid` words.
+    Invalid(String),
+    /// The register held a number that the profile does not name.
+    UnknownValue(i128),
+    /// A floating-point register held no number.
+    NotANumber,
+    /// The text register held no text.
+    NotText,
+    /// The device answered the read with this exception.
+    Exception(u8),
+}
+
+impl fmt::Display for Missing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Missing::NotYetRead => write!(f, "not yet read"),
+            Missing::Offline => write!(f, "the device does not answer"),
+            Missing::WaitingFor(point) => write!(f, "waiting for {point}"),
+            Missing::NotInThisMode => write!(f, "no reading in this mode"),
+            Missing::Invalid(reason) => write!(f, "{reason}"),
+            Missing::UnknownValue(raw) => write!(f, "unknown value {raw}"),
+            Missing::NotANumber => write!(f, "not a number"),
+            Missing::NotText => write!(f, "not a text"),
+            Missing::Exception(code) => write!(f, "exception {code}"),
+        }
+    }
+}
+
+impl fmt::Display for Reading {
+    /// The text published on MQTT: `21.5`, `ON`, `automatic`, `None`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Reading::Number(number) => write!(f, "{number}"),
+            Reading::Float(number) => write!(f, "{number}"),
+            Reading::Flag(true) => write!(f, "ON"),
+            Reading::Flag(false) => write!(f, "OFF"),
+            Reading::Name(name) => write!(f, "{name}"),
+            Reading::Text(text) => write!(f, "{text}"),
+            Reading::Missing(_) => write!(f, "None"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn decimals_are_read_and_told_with_the_digits_they_have() {
+        for (text, told) in [
+            ("21.5", "21.5"),
+            ("21.50", "21.50"),
+            ("-0.05", "-0.05"),
+            ("20", "20"),
+            ("21.0", "21.0"),
+            ("1e-05", "0.00001"),
+            ("2.5E3", "2500"),
+            ("+7", "7"),
+            ("0", "0"),
+        ] {
+            assert_eq!(Decimal::parse(text).expect(text).to_string(), told, "{text}");
+        }
+        for text in ["", "-", ".", "1,5", "nan", "inf", "0x10", "1e", "1e99", "--1", "1 ", "٣"] {
+            assert_eq!(Decimal::parse(text), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_decimal_is_divided_only_without_a_rest() {
+        let step = Decimal::parse("0.01").expect("a decimal");
+        assert_eq!(Decimal::parse("30").expect("a decimal").divided_exactly_by(step), Some(3000));
+        assert_eq!(Decimal::parse("0.005").expect("a decimal").divided_exactly_by(step), None);
+        assert_eq!(Decimal::ONE.divided_exactly_by(Decimal::ZERO), None);
+    }
+}
