@@ -1,1 +1,3 @@
+//! The edge does: everything that waits, opens and asks the time. It decides nothing.
 
+pub mod clock;

@@ -200,6 +200,7 @@ impl Poll {
 }
 
 /// How the words of a point are understood.
+#[expect(clippy::large_enum_variant, reason = "nearly every point is plain, and a device has few")]
 #[derive(Clone, Debug, PartialEq)]
 pub enum Encoding {
     Plain(Form),
