@@ -1,1 +1,84 @@
+//! The command line: one verb per file.
+//!
+//! A new verb is a file `src/cli/VERB.rs` and two lines here: `mod VERB;` and its line in `verbs!`.
+//! The file holds
+//!
+//! * `pub struct Args`, derived from `clap::Args`: its doc comment is the verb's help, and
+//!   `#[command(after_help = "Example:\n  busker VERB …")]` ends that help with an example;
+//! * `pub fn run(args: Args) -> Result<(), Failure>`.
+//!
+//! Data goes to standard output through [`output`], everything else to standard error. A verb never
+//! ends the process by itself and never prints its own failure: it returns a [`Failure`], and
+//! `main.rs` prints it and chooses the exit code.
 
+pub mod output;
+
+use clap::{Parser, Subcommand};
+
+/// One line per verb: its module, which is also its name on the command line, and its variant.
+macro_rules! verbs {
+    ($($module:ident $Variant:ident,)*) => {
+        #[derive(Subcommand)]
+        enum Verb {
+            $($Variant($module::Args),)*
+        }
+
+        #[allow(unreachable_code, reason = "until the first verb is there")]
+        /// Parses the arguments and runs the verb. A wrong argument ends the process with exit code 2.
+        pub fn run() -> Result<(), Failure> {
+            match CommandLine::parse().verb {
+                $(Verb::$Variant(args) => $module::run(args),)*
+            }
+        }
+    };
+}
+
+verbs! {}
+
+/// Connects Modbus devices to Home Assistant and to anything that speaks MQTT.
+#[derive(Parser)]
+#[command(
+    name = "busker",
+    version,
+    disable_help_subcommand = true,
+    after_help = "Example:\n  busker run --config /etc/busker/busker.yaml"
+)]
+struct CommandLine {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+/// Why a verb did not do what was asked; `main.rs` turns it into text and an exit code.
+#[derive(Debug)]
+pub enum Failure {
+    /// The input was right, and it failed all the same.
+    Failed(anyhow::Error),
+    /// What was asked makes no sense: an unknown device, a value out of range.
+    WrongInput(anyhow::Error),
+    /// Faults in files, rendered, each beginning with its place.
+    Faults(Vec<String>),
+}
+
+impl Failure {
+    pub fn wrong_input(error: impl Into<anyhow::Error>) -> Failure {
+        Failure::WrongInput(error.into())
+    }
+
+    /// A wrong input that is one sentence.
+    pub fn wrong(message: impl std::fmt::Display) -> Failure {
+        Failure::WrongInput(anyhow::anyhow!("{message}"))
+    }
+
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Failure::Failed(_) => 1,
+            Failure::WrongInput(_) | Failure::Faults(_) => 2,
+        }
+    }
+}
+
+impl<E: Into<anyhow::Error>> From<E> for Failure {
+    fn from(error: E) -> Failure {
+        Failure::Failed(error.into())
+    }
+}
