@@ -1,1 +1,509 @@
+//! Words to readings, and wishes to words.
+//!
+//! Reading: words → field of bits → raw number → `invalid`, names → scale, decimals, offset.
+//! Writing runs the same way back, and refuses with a reason that a person can act on.
+//!
+//! What another register decides (case, unit, decimals) comes in as `known`: the raw fields of the
+//! device's points, where they have been read and still hold.
 
+use crate::engine::address::Address;
+use crate::engine::device::{
+    Case, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Unit, WriteRule,
+};
+use crate::engine::value::{Decimal, Missing, Reading};
+
+/// One point's interpretation as it is now, with everything decided that other registers decide.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Resolved<'d> {
+    pub form: &'d Form,
+    /// Digits behind the dot; `None` for floats that come as they are, and for all that is no number.
+    pub decimals: Option<u8>,
+    /// How many of those digits are a division by a power of ten.
+    shift: u8,
+    pub unit: Option<String>,
+    /// The active case's name, for a point with cases.
+    pub case: Option<&'d str>,
+}
+
+/// What `point` means at present. Missing says which point it waits for, or that there is no reading.
+pub fn resolve<'d>(
+    device: &'d Device,
+    point: PointIndex,
+    known: &[Option<i128>],
+) -> Result<Resolved<'d>, Missing> {
+    match &device.points[point].encoding {
+        Encoding::Plain(form) => resolve_form(device, form, None, known),
+        Encoding::Cases { by, cases } => {
+            let case = active_case(device, *by, cases, known)?;
+            let form = case.form.as_ref().ok_or(Missing::NotInThisMode)?;
+            resolve_form(device, form, Some(&case.name), known)
+        }
+    }
+}
+
+fn active_case<'d>(
+    device: &Device,
+    by: PointIndex,
+    cases: &'d [Case],
+    known: &[Option<i128>],
+) -> Result<&'d Case, Missing> {
+    let key = known_value(device, by, known)?;
+    cases.iter().find(|case| case.key == key).ok_or_else(|| {
+        Missing::Invalid(format!("{} holds {key}, which has no meaning", device.points[by].name))
+    })
+}
+
+fn known_value(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Result<i128, Missing> {
+    known.get(point).copied().flatten().ok_or_else(|| Missing::WaitingFor(device.points[point].name.clone()))
+}
+
+fn resolve_form<'d>(
+    device: &'d Device,
+    form: &'d Form,
+    case: Option<&'d str>,
+    known: &[Option<i128>],
+) -> Result<Resolved<'d>, Missing> {
+    let shift = match form.decimals {
+        None => 0,
+        Some(Decimals::Fixed(decimals)) => decimals,
+        Some(Decimals::By(point)) => {
+            let held = known_value(device, point, known)?;
+            u8::try_from(held).ok().filter(|decimals| *decimals <= Decimal::DECIMALS_MAX).ok_or_else(
+                || Missing::Invalid(format!("{} holds {held} decimals", device.points[point].name)),
+            )?
+        }
+    };
+    let unit = match &form.unit {
+        Unit::None => None,
+        Unit::Fixed(unit) => Some(unit.clone()),
+        Unit::By(point) => {
+            let held = known_value(device, *point, known)?;
+            let names = device.points[*point].plain().map_or(&[][..], |form| form.names.list());
+            let unit = name_of(names, held).ok_or_else(|| {
+                Missing::Invalid(format!("{} holds {held}, which is no unit", device.points[*point].name))
+            })?;
+            Some(unit.to_string())
+        }
+    };
+    let decimals = match form.kind {
+        Kind::F32 | Kind::F64 => form.decimals.map(|_| shift),
+        Kind::Bool => None,
+        kind if kind.is_text() || matches!(form.names, Names::All(_)) => None,
+        _ => Some((form.scale.decimals + shift).max(form.offset.decimals)),
+    };
+    Ok(Resolved { form, decimals, shift, unit, case })
+}
+
+fn name_of(names: &[(i128, String)], raw: i128) -> Option<&str> {
+    names.iter().find(|(value, _)| *value == raw).map(|(_, name)| name.as_str())
+}
+
+/// A register field before any meaning: what `values`, `invalid` and `known` speak of.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Raw {
+    Integer(i128),
+    Float(f64),
+    Text(String),
+    /// The words are no number (NaN, infinity, a letter where a decimal digit belongs) or no text.
+    Nonsense,
+}
+
+/// The words of one value, cut out of a read that began at `first`: registers as they are, a field of
+/// bits shifted down into one word, coils packed with the first one lowest. `None` if the read does
+/// not cover the address.
+pub fn words_at(address: Address, first: u16, words: &[u16]) -> Option<Vec<u16>> {
+    let start = usize::from(address.span.first().checked_sub(first)?);
+    let end = start + address.span.count() as usize;
+    let part = words.get(start..end)?;
+    if address.span.table().is_bits() {
+        return Some(vec![part.iter().rev().fold(0, |field, bit| field << 1 | (bit & 1))]);
+    }
+    match address.bits {
+        Some(bits) => Some(vec![bits.extract(part[0])]),
+        None => Some(part.to_vec()),
+    }
+}
+
+/// The raw field that `words` hold in this form.
+pub fn raw(form: &Form, words: &[u16]) -> Raw {
+    let count = usize::from(form.kind.registers());
+    let Some(words) = words.get(..count) else { return Raw::Nonsense };
+    if form.kind.is_text() {
+        return raw_text(form, words);
+    }
+    let unsigned = most_significant_first(form, words)
+        .into_iter()
+        .fold(0u64, |value, word| value << 16 | u64::from(word));
+    match form.kind {
+        Kind::I16 => Raw::Integer(i128::from(unsigned as u16 as i16)),
+        Kind::I32 => Raw::Integer(i128::from(unsigned as u32 as i32)),
+        Kind::I64 => Raw::Integer(i128::from(unsigned as i64)),
+        Kind::F32 => {
+            let value = f32::from_bits(unsigned as u32);
+            // The shortest decimal that names this f32: 21.1, not 21.100000381.
+            if value.is_finite() {
+                value.to_string().parse().map_or(Raw::Nonsense, Raw::Float)
+            } else {
+                Raw::Nonsense
+            }
+        }
+        Kind::F64 => {
+            let value = f64::from_bits(unsigned);
+            if value.is_finite() { Raw::Float(value) } else { Raw::Nonsense }
+        }
+        Kind::Bcd16 | Kind::Bcd32 => {
+            format!("{unsigned:x}").parse::<i128>().map_or(Raw::Nonsense, Raw::Integer)
+        }
+        _ => Raw::Integer(i128::from(unsigned)),
+    }
+}
+
+fn raw_text(form: &Form, words: &[u16]) -> Raw {
+    let swaps_bytes = form.order.swaps_bytes();
+    let bytes: Vec<u8> = words
+        .iter()
+        .flat_map(|word| if swaps_bytes { word.to_le_bytes() } else { word.to_be_bytes() })
+        .collect();
+    let text = match form.kind {
+        Kind::LetterNumber => match bytes[0] {
+            letter if letter.is_ascii_alphabetic() => Some(format!("{}{:03}", char::from(letter), bytes[1])),
+            _ => None,
+        },
+        Kind::DayMonthYear => day_month_year(words[0]),
+        _ => {
+            let end = bytes.iter().rposition(|byte| !matches!(byte, 0 | b' ')).map_or(0, |last| last + 1);
+            String::from_utf8(bytes[..end].to_vec()).ok().filter(|text| !text.contains(char::is_control))
+        }
+    };
+    text.map_or(Raw::Nonsense, Raw::Text)
+}
+
+/// `01018` is 01.01.2018 (FuehlerSysteme, Rreg 79). The one digit of the year is of the 2010s, as in
+/// the manual's example.
+fn day_month_year(word: u16) -> Option<String> {
+    let (day, month, year) = (word / 1000, word / 10 % 100, word % 10);
+    ((1..=31).contains(&day) && (1..=12).contains(&month)).then(|| format!("{day:02}.{month:02}.201{year}"))
+}
+
+fn most_significant_first(form: &Form, words: &[u16]) -> Vec<u16> {
+    let mut words = words.to_vec();
+    if form.order.low_word_first() {
+        words.reverse();
+    }
+    if form.order.swaps_bytes() {
+        words.iter_mut().for_each(|word| *word = word.swap_bytes());
+    }
+    words
+}
+
+/// What the words (from [`words_at`]) say.
+pub fn read(resolved: &Resolved<'_>, words: &[u16]) -> Reading {
+    let form = resolved.form;
+    let raw = raw(form, words);
+    if let Some(reason) = invalid_reason(form, words, &raw) {
+        return Reading::Missing(Missing::Invalid(reason));
+    }
+    match raw {
+        Raw::Nonsense if form.kind.is_text() => Reading::Missing(Missing::NotText),
+        Raw::Nonsense => Reading::Missing(Missing::NotANumber),
+        Raw::Text(text) => Reading::Text(text),
+        Raw::Float(number) => read_float(resolved, number),
+        Raw::Integer(raw) => read_integer(resolved, raw),
+    }
+}
+
+fn invalid_reason(form: &Form, words: &[u16], raw: &Raw) -> Option<String> {
+    if form.invalid.is_empty() {
+        return None;
+    }
+    // A profile may name the word as the manual prints it (0x8000) or as it is decoded (-32768).
+    let count = usize::from(form.kind.registers()).min(words.len());
+    let pattern = most_significant_first(form, &words[..count])
+        .into_iter()
+        .fold(0i128, |value, word| value << 16 | i128::from(word));
+    let decoded = if let Raw::Integer(raw) = raw { *raw } else { pattern };
+    form.invalid
+        .iter()
+        .find(|(word, _)| *word == pattern || *word == decoded)
+        .map(|(_, reason)| reason.clone())
+}
+
+fn read_integer(resolved: &Resolved<'_>, raw: i128) -> Reading {
+    let form = resolved.form;
+    match (&form.names, name_of(form.names.list(), raw)) {
+        (_, Some(name)) if form.kind != Kind::Bool => return Reading::Name(name.to_string()),
+        (Names::All(_), None) => return Reading::Missing(Missing::UnknownValue(raw)),
+        _ => {}
+    }
+    if form.kind == Kind::Bool {
+        return match raw {
+            0 => Reading::Flag(false),
+            1 => Reading::Flag(true),
+            other => Reading::Missing(Missing::UnknownValue(other)),
+        };
+    }
+    match to_unit(resolved, raw) {
+        Some(number) => Reading::Number(number),
+        None => Reading::Missing(Missing::NotANumber),
+    }
+}
+
+/// A raw number in the point's unit, with all the digits that scale, decimals and offset give.
+pub fn to_unit(resolved: &Resolved<'_>, raw: i128) -> Option<Decimal> {
+    let form = resolved.form;
+    let units = raw.checked_mul(form.scale.units)?;
+    Decimal { units, decimals: form.scale.decimals.checked_add(resolved.shift)? }.checked_add(form.offset)
+}
+
+fn read_float(resolved: &Resolved<'_>, raw: f64) -> Reading {
+    let form = resolved.form;
+    let mut value = raw;
+    if form.scale != Decimal::ONE || form.offset != Decimal::ZERO {
+        value = raw * form.scale.to_f64() + form.offset.to_f64();
+        // No more digits than the register had: 0.1 × 3 is 0.3.
+        let digits = if form.kind == Kind::F32 { 6 } else { 14 };
+        value = format!("{value:.digits$e}").parse().unwrap_or(value);
+    }
+    if let Some(decimals) = resolved.decimals {
+        value = format!("{value:.*}", usize::from(decimals)).parse().unwrap_or(value);
+    }
+    // Minus zero is told as zero.
+    Reading::Float(value + 0.0)
+}
+
+/// Between which values a number may be written, in the unit shown.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    pub min: Decimal,
+    pub max: Decimal,
+    /// The finest step that makes a difference; `None` for floats without one.
+    pub step: Option<Decimal>,
+}
+
+/// The limits of a writable number as they are now; `None` for what is no number, or a float
+/// without any.
+pub fn limits(resolved: &Resolved<'_>, rule: &WriteRule) -> Option<Limits> {
+    let form = resolved.form;
+    let resolution = form
+        .kind
+        .integer_range()
+        .map(|_| Decimal { units: form.scale.units.abs(), decimals: form.scale.decimals + resolved.shift });
+    match rule {
+        WriteRule::Range { min, max, step } => {
+            // Where a register gives the decimals, the profile's range is the register's own.
+            let shift = if matches!(form.decimals, Some(Decimals::By(_))) { resolved.shift } else { 0 };
+            let shifted = |number: Decimal| Decimal { decimals: number.decimals + shift, ..number };
+            Some(Limits { min: shifted(*min), max: shifted(*max), step: step.map(shifted).or(resolution) })
+        }
+        WriteRule::Any if matches!(form.names, Names::All(_)) || form.kind == Kind::Bool => None,
+        WriteRule::Any => {
+            let capacity = form.kind.integer_range().and_then(|(low, high)| {
+                let (a, b) = (to_unit(resolved, low)?, to_unit(resolved, high)?);
+                Some(if a.compare(b).is_le() { (a, b) } else { (b, a) })
+            });
+            let (min, max) = measuring_range(resolved).or(capacity)?;
+            Some(Limits { min, max, step: resolution })
+        }
+        WriteRule::Names(_) | WriteRule::Press { .. } => None,
+    }
+}
+
+/// The manual's range in the unit that is shown now: profiles give temperatures in °C.
+fn measuring_range(resolved: &Resolved<'_>) -> Option<(Decimal, Decimal)> {
+    let (mut min, mut max) = resolved.form.range?;
+    if resolved.form.difference {
+        max = max.checked_add(min.negated())?;
+        min = max.negated();
+    }
+    if resolved.unit.as_deref() == Some("°F") {
+        let factor = Decimal { units: 18, decimals: 1 };
+        let zero = Decimal::integer(if resolved.form.difference { 0 } else { 32 });
+        min = min.checked_mul(factor)?.checked_add(zero)?.normalized();
+        max = max.checked_mul(factor)?.checked_add(zero)?.normalized();
+    }
+    Some((min, max))
+}
+
+/// The words that make `text` true for a point, for its whole span: a field of bits as one word not
+/// yet shifted, a value shorter than its span filled up with zeros. `Err` is the rule that the wish
+/// breaks, in words for a person.
+pub fn encode(
+    point: &Point,
+    rule: &WriteRule,
+    resolved: &Resolved<'_>,
+    text: &str,
+) -> Result<Vec<u16>, String> {
+    let form = resolved.form;
+    if let WriteRule::Press { word, .. } = rule {
+        return if text == "PRESS" { Ok(vec![*word]) } else { Err(format!("`{text}` is not `PRESS`")) };
+    }
+    let mut words = if form.kind.is_text() {
+        encode_text(form, text)?
+    } else if form.kind == Kind::Bool {
+        match text {
+            "ON" => vec![1],
+            "OFF" => vec![0],
+            _ => return Err(format!("`{text}` is neither `ON` nor `OFF`")),
+        }
+    } else if let Some(raw) = named_value(form, rule, text)? {
+        encode_integer(form, raw)
+    } else if form.kind.is_float() {
+        encode_float(resolved, rule, text)?
+    } else {
+        encode_integer(form, checked_number(point, resolved, rule, text)?)
+    };
+    let registers = if point.at.span.table().is_bits() { 1 } else { point.at.span.count() as usize };
+    words.resize(registers.max(words.len()), 0);
+    Ok(words)
+}
+
+/// The raw value of a name, if `text` is one that may be written; an error if only names may be.
+fn named_value(form: &Form, rule: &WriteRule, text: &str) -> Result<Option<i128>, String> {
+    let named = form.names.list().iter().find(|(_, name)| name == text);
+    let allowed = |name: &str| match rule {
+        WriteRule::Names(names) => names.iter().any(|allowed| allowed == name),
+        _ => true,
+    };
+    match named {
+        Some((raw, name)) if allowed(name) => Ok(Some(*raw)),
+        _ if matches!(form.names, Names::All(_)) || matches!(rule, WriteRule::Names(_)) => {
+            let names: Vec<String> = form
+                .names
+                .list()
+                .iter()
+                .filter(|(_, name)| allowed(name))
+                .map(|(_, name)| format!("`{name}`"))
+                .collect();
+            Err(format!("`{text}` is none of {}", names.join(", ")))
+        }
+        _ => Ok(None),
+    }
+}
+
+fn checked_number(
+    point: &Point,
+    resolved: &Resolved<'_>,
+    rule: &WriteRule,
+    text: &str,
+) -> Result<i128, String> {
+    let form = resolved.form;
+    let wanted = Decimal::parse(text.trim()).ok_or_else(|| format!("`{text}` is not a number"))?;
+    check_limits(resolved, rule, wanted, text)?;
+    let step = match rule {
+        WriteRule::Range { step: Some(_), .. } => limits(resolved, rule).and_then(|limits| limits.step),
+        _ => None,
+    };
+    let overflow = || format!("`{text}` is too large");
+    let stepped = match step {
+        Some(step) => {
+            let steps = rounded_quotient(wanted, step).ok_or_else(overflow)?;
+            Decimal::integer(steps).checked_mul(step).ok_or_else(overflow)?
+        }
+        None => wanted,
+    };
+    let above_offset = stepped.checked_add(form.offset.negated()).ok_or_else(overflow)?;
+    let resolution = Decimal { units: form.scale.units, decimals: form.scale.decimals + resolved.shift };
+    let raw = rounded_quotient(above_offset, resolution).ok_or_else(overflow)?;
+    let (mut low, mut high) = form.kind.integer_range().ok_or_else(overflow)?;
+    let field_bits = match point.at.bits {
+        Some(bits) => Some(u32::from(bits.width())),
+        None if point.at.span.table().is_bits() => Some(point.at.span.count()),
+        None => None,
+    };
+    if let Some(width) = field_bits {
+        (low, high) = (low.max(0), high.min((1i128 << width) - 1));
+    }
+    if raw < low || raw > high {
+        return Err(format!("`{text}` does not fit the register, which holds {low} to {high}"));
+    }
+    Ok(raw)
+}
+
+fn check_limits(
+    resolved: &Resolved<'_>,
+    rule: &WriteRule,
+    wanted: Decimal,
+    text: &str,
+) -> Result<(), String> {
+    let Some(limits) = limits(resolved, rule) else { return Ok(()) };
+    if wanted.compare(limits.min).is_lt() || wanted.compare(limits.max).is_gt() {
+        return Err(format!("`{text}` is outside {} to {}", limits.min, limits.max));
+    }
+    Ok(())
+}
+
+/// `number ÷ divisor`, rounded to the nearest whole, halves away from zero.
+fn rounded_quotient(number: Decimal, divisor: Decimal) -> Option<i128> {
+    let decimals = number.decimals.max(divisor.decimals);
+    let (a, b) = (number.with_decimals(decimals)?.units, divisor.with_decimals(decimals)?.units);
+    if b == 0 {
+        return None;
+    }
+    let (quotient, rest) = (a / b, a % b);
+    let away = if (a < 0) == (b < 0) { 1 } else { -1 };
+    Some(if rest.unsigned_abs() * 2 >= b.unsigned_abs() { quotient + away } else { quotient })
+}
+
+fn encode_float(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Result<Vec<u16>, String> {
+    let form = resolved.form;
+    let wanted = Decimal::parse(text.trim()).ok_or_else(|| format!("`{text}` is not a number"))?;
+    check_limits(resolved, rule, wanted, text)?;
+    let register = (wanted.to_f64() - form.offset.to_f64()) / form.scale.to_f64();
+    let finite =
+        |fits: bool| if fits { Ok(()) } else { Err(format!("`{text}` is too large for the register")) };
+    let bytes = if form.kind == Kind::F32 {
+        finite((register as f32).is_finite())?;
+        (register as f32).to_be_bytes().to_vec()
+    } else {
+        finite(register.is_finite())?;
+        register.to_be_bytes().to_vec()
+    };
+    let words = bytes.chunks(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
+    Ok(in_wire_order(form, words))
+}
+
+fn encode_integer(form: &Form, raw: i128) -> Vec<u16> {
+    let bits = match form.kind {
+        Kind::Bcd16 | Kind::Bcd32 => u64::from_str_radix(&raw.to_string(), 16).unwrap_or(0),
+        _ => raw as u64,
+    };
+    let count = form.kind.registers();
+    let words = (0..count).rev().map(|index| (bits >> (16 * index)) as u16).collect();
+    in_wire_order(form, words)
+}
+
+fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
+    match form.kind {
+        Kind::LetterNumber => {
+            let letter = text.bytes().next().filter(u8::is_ascii_alphabetic);
+            let number = text.get(1..).and_then(|digits| digits.parse::<u8>().ok());
+            match (letter, number) {
+                (Some(letter), Some(number)) => {
+                    Ok(in_wire_order(form, vec![u16::from_be_bytes([letter, number])]))
+                }
+                _ => Err(format!("`{text}` is not a letter and a number from 0 to 255, as in `R017`")),
+            }
+        }
+        Kind::Text { registers } => {
+            let room = usize::from(registers) * 2;
+            if text.len() > room || text.contains(char::is_control) {
+                return Err(format!("`{text}` is longer than {room} bytes or has control characters"));
+            }
+            let mut bytes = text.as_bytes().to_vec();
+            bytes.resize(room, 0);
+            let swap = form.order.swaps_bytes();
+            let word = |pair: &[u8]| u16::from_be_bytes([pair[0], pair[1]]);
+            Ok(bytes.chunks(2).map(|pair| if swap { word(pair).swap_bytes() } else { word(pair) }).collect())
+        }
+        _ => Err("a date cannot be written".to_string()),
+    }
+}
+
+/// The inverse of [`most_significant_first`], which is its own inverse.
+fn in_wire_order(form: &Form, words: Vec<u16>) -> Vec<u16> {
+    most_significant_first(form, &words)
+}
+
+#[cfg(test)]
+#[path = "codec_tests.rs"]
+mod tests;

@@ -1,0 +1,214 @@
+//! Tables for the codec: what registers say, and what may be written.
+
+use super::*;
+use crate::engine::address::{Address, Bits, Span, Table};
+use crate::engine::device::{Limits as WireLimits, Order, Poll, Presentation, Quirks, Wire, Write};
+
+fn decimal(text: &str) -> Decimal {
+    Decimal::parse(text).expect("a decimal in a test")
+}
+
+fn words(hex: &str) -> Vec<u16> {
+    hex.split_whitespace().map(|word| u16::from_str_radix(word, 16).expect("hex in a test")).collect()
+}
+
+/// A device of one writable point at `holding 0` in this form.
+fn device(form: Form, at: Address, rule: WriteRule) -> Device {
+    let point = Point {
+        name: "point".into(),
+        at,
+        also: None,
+        encoding: Encoding::Plain(form),
+        poll: Poll::Fast,
+        write: Some(Write { at, with: None, rule }),
+        persistent: false,
+        read_clears: false,
+        default: None,
+        re_read: Vec::new(),
+        deadband: None,
+        presentation: Presentation::default(),
+    };
+    Device {
+        profile: "test".into(),
+        manufacturer: String::new(),
+        model: String::new(),
+        source: String::new(),
+        identify: None,
+        wire: Wire {
+            limits: WireLimits::default(),
+            readable: Vec::new(),
+            forbidden: Vec::new(),
+            intervals: Default::default(),
+            response_timeout: None,
+            quirks: Quirks::default(),
+            watchdog: None,
+        },
+        points: vec![point],
+        left_out: Vec::new(),
+    }
+}
+
+fn registers(count: u16) -> Address {
+    Address { span: Span::with_count(Table::Holding, 0, count).expect("a span"), bits: None }
+}
+
+fn check_read(form: Form, hex: &str, expected: &str) {
+    let device = device(form.clone(), registers(form.kind.registers()), WriteRule::Any);
+    let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+    assert_eq!(read(&resolved, &words(hex)).to_string(), expected, "{form:?} {hex}");
+}
+
+fn check_write(form: Form, rule: WriteRule, text: &str, expected: Result<&str, &str>) {
+    let device = device(form.clone(), registers(form.kind.registers()), rule.clone());
+    let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+    let found = encode(&device.points[0], &rule, &resolved, text);
+    assert_eq!(found, expected.map(words).map_err(str::to_string), "{form:?} {text}");
+}
+
+fn with(kind: Kind, change: impl FnOnce(&mut Form)) -> Form {
+    let mut form = Form::new(kind);
+    change(&mut form);
+    form
+}
+
+#[test]
+fn numbers_keep_the_digits_of_their_scale() {
+    let tenth = |kind| with(kind, |form| form.decimals = Some(Decimals::Fixed(1)));
+    check_read(tenth(Kind::I16), "FF9C", "-10.0");
+    check_read(tenth(Kind::I16), "0000", "0.0");
+    check_read(tenth(Kind::U16), "FF9C", "6543.6");
+    check_read(with(Kind::I16, |form| form.scale = decimal("0.0003125")), "7FFF", "10.2396875");
+    check_read(with(Kind::I16, |form| form.scale = decimal("100")), "8000", "-3276800");
+    check_read(with(Kind::U16, |form| form.offset = decimal("-273.15")), "0126", "20.85");
+    check_read(Form::new(Kind::U48), "FFFF FFFF FFFF", "281474976710655");
+    check_read(Form::new(Kind::U64), "FFFF FFFF FFFF FFFF", "18446744073709551615");
+    check_read(Form::new(Kind::I64), "FFFF FFFF FFFF FFFE", "-2");
+    check_read(Form::new(Kind::Bcd32), "0012 3456", "123456");
+    check_read(Form::new(Kind::Bcd16), "00A1", "None");
+}
+
+#[test]
+fn four_orders_of_the_same_number_read_the_same() {
+    for (order, hex) in [
+        (Order::Abcd, "1234 5678"),
+        (Order::Cdab, "5678 1234"),
+        (Order::Badc, "3412 7856"),
+        (Order::Dcba, "7856 3412"),
+    ] {
+        check_read(with(Kind::U32, |form| form.order = order), hex, "305419896");
+    }
+    check_read(with(Kind::U48, |form| form.order = Order::Dcba), "0300 0200 0100", "4295098371");
+}
+
+#[test]
+fn floats_are_told_shortest_and_without_exponent() {
+    check_read(Form::new(Kind::F32), "41A8 CCCD", "21.1");
+    check_read(Form::new(Kind::F32), "41A8 0000", "21");
+    check_read(Form::new(Kind::F32), "8000 0000", "0");
+    check_read(Form::new(Kind::F32), "2EDB E6FF", "0.0000000001");
+    check_read(Form::new(Kind::F32), "7FC0 0000", "None");
+    check_read(Form::new(Kind::F32), "FF80 0000", "None");
+    check_read(with(Kind::F32, |form| form.scale = decimal("0.001")), "41A8 CCCD", "0.0211");
+    check_read(with(Kind::F32, |form| form.decimals = Some(Decimals::Fixed(2))), "4049 0FDB", "3.14");
+}
+
+#[test]
+fn names_and_sentinels_come_before_arithmetic() {
+    let sentinel = |kind| {
+        with(kind, |form| {
+            form.names = Names::Some(vec![(11111, "automatic".into())]);
+            form.decimals = Some(Decimals::Fixed(1));
+            form.invalid = vec![(0x8000, "open loop".into())];
+        })
+    };
+    check_read(sentinel(Kind::I16), "2B67", "automatic");
+    check_read(sentinel(Kind::I16), "2B68", "1111.2");
+    check_read(sentinel(Kind::I16), "8000", "None");
+    let named =
+        with(Kind::U16, |form| form.names = Names::All(vec![(0, "OFF".into()), (11111, "automatic".into())]));
+    check_read(named.clone(), "0000", "OFF");
+    check_read(named, "0002", "None");
+    check_read(Form::new(Kind::Bool), "0001", "ON");
+    check_read(Form::new(Kind::Bool), "0002", "None");
+}
+
+#[test]
+fn texts_codes_and_dates() {
+    check_read(Form::new(Kind::Text { registers: 3 }), "4D52 2D38 0000", "MR-8");
+    check_read(with(Kind::Text { registers: 2 }, |form| form.order = Order::Badc), "524D 3820", "MR 8");
+    check_read(Form::new(Kind::Text { registers: 1 }), "FF01", "None");
+    check_read(Form::new(Kind::LetterNumber), "5211", "R017");
+    check_read(Form::new(Kind::LetterNumber), "0011", "None");
+    check_read(Form::new(Kind::DayMonthYear), "03FA", "01.01.2018");
+    check_read(Form::new(Kind::DayMonthYear), "0000", "None");
+}
+
+#[test]
+fn a_wish_is_checked_rounded_and_encoded() {
+    let seconds = with(Kind::U16, |form| form.scale = decimal("0.01"));
+    let range = |min: &str, max: &str, step: Option<&str>| WriteRule::Range {
+        min: decimal(min),
+        max: decimal(max),
+        step: step.map(decimal),
+    };
+    let watchdog = range("0", "655.35", None);
+    check_write(seconds.clone(), watchdog.clone(), "30", Ok("0BB8"));
+    check_write(seconds.clone(), watchdog.clone(), "21.0", Ok("0834"));
+    check_write(seconds.clone(), watchdog.clone(), "1e-05", Ok("0000"));
+    check_write(seconds.clone(), watchdog.clone(), "655.36", Err("`655.36` is outside 0 to 655.35"));
+    check_write(seconds.clone(), watchdog.clone(), "-1", Err("`-1` is outside 0 to 655.35"));
+    check_write(seconds.clone(), watchdog.clone(), "1,5", Err("`1,5` is not a number"));
+    check_write(seconds, watchdog, "None", Err("`None` is not a number"));
+    let half_steps = with(Kind::U16, |form| form.decimals = Some(Decimals::Fixed(1)));
+    check_write(half_steps, range("4", "20", Some("0.5")), "4.3", Ok("002D"));
+    check_write(Form::new(Kind::I16), WriteRule::Any, "-32768", Ok("8000"));
+    check_write(Form::new(Kind::I16), WriteRule::Any, "32768", Err("`32768` is outside -32768 to 32767"));
+    check_write(Form::new(Kind::U48), WriteRule::Any, "281474976710655", Ok("FFFF FFFF FFFF"));
+    check_write(Form::new(Kind::F32), WriteRule::Any, "21.1", Ok("41A8 CCCD"));
+    check_write(Form::new(Kind::Bool), WriteRule::Any, "on", Err("`on` is neither `ON` nor `OFF`"));
+    check_write(Form::new(Kind::LetterNumber), WriteRule::Any, "R017", Ok("5211"));
+    check_write(
+        Form::new(Kind::U16),
+        WriteRule::Press { word: 0x55AA, self_clearing: true },
+        "PRESS",
+        Ok("55AA"),
+    );
+    let sentinel = with(Kind::I16, |form| form.names = Names::Some(vec![(11111, "automatic".into())]));
+    check_write(sentinel.clone(), range("-9999", "9999", None), "automatic", Ok("2B67"));
+    check_write(sentinel, range("-9999", "9999", None), "11111", Err("`11111` is outside -9999 to 9999"));
+    let named = with(Kind::U16, |form| form.names = Names::All(vec![(0, "OFF".into()), (1, "ON".into())]));
+    check_write(named.clone(), WriteRule::Names(vec!["OFF".into()]), "ON", Err("`ON` is none of `OFF`"));
+    check_write(named, WriteRule::Any, "ON", Ok("0001"));
+}
+
+#[test]
+fn a_field_of_bits_takes_only_what_fits_it() {
+    let at = Address { span: Span::single(Table::Holding, 36), bits: Bits::new(8, 15) };
+    let rule = WriteRule::Range { min: Decimal::ZERO, max: Decimal::integer(999), step: None };
+    let device = device(Form::new(Kind::U16), at, rule.clone());
+    let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+    assert_eq!(encode(&device.points[0], &rule, &resolved, "9"), Ok(vec![9]));
+    assert_eq!(
+        encode(&device.points[0], &rule, &resolved, "256"),
+        Err("`256` does not fit the register, which holds 0 to 255".to_string())
+    );
+    assert_eq!(words_at(at, 32, &words("0 0 0 0 0703")), Some(vec![7]));
+    assert_eq!(words_at(at, 37, &words("0703")), None);
+}
+
+#[test]
+fn fahrenheit_moves_the_limits_of_values_and_of_differences() {
+    let mut temperature = with(Kind::F32, |form| {
+        form.range = Some((decimal("-50"), decimal("150")));
+        form.unit = Unit::Fixed("°F".into());
+    });
+    let limits_of = |form: &Form| {
+        let device = device(form.clone(), registers(2), WriteRule::Any);
+        let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+        let limits = limits(&resolved, &WriteRule::Any).expect("limits");
+        format!("{} {}", limits.min, limits.max)
+    };
+    assert_eq!(limits_of(&temperature), "-58 302");
+    temperature.difference = true;
+    assert_eq!(limits_of(&temperature), "-360 360");
+}
