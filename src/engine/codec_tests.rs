@@ -2,7 +2,8 @@
 
 use super::*;
 use crate::engine::address::{Address, Bits, Span, Table};
-use crate::engine::device::{Limits as WireLimits, Order, Poll, Presentation, Quirks, Wire, Write};
+use crate::engine::device::{Order, Poll, Write};
+use crate::engine::test_device::{device_of, point};
 
 fn decimal(text: &str) -> Decimal {
     Decimal::parse(text).expect("a decimal in a test")
@@ -14,38 +15,10 @@ fn words(hex: &str) -> Vec<u16> {
 
 /// A device of one writable point at `holding 0` in this form.
 fn device(form: Form, at: Address, rule: WriteRule) -> Device {
-    let point = Point {
-        name: "point".into(),
-        at,
-        also: None,
-        encoding: Encoding::Plain(form),
-        poll: Poll::Fast,
-        write: Some(Write { at, with: None, rule }),
-        persistent: false,
-        read_clears: false,
-        default: None,
-        re_read: Vec::new(),
-        deadband: None,
-        presentation: Presentation::default(),
-    };
-    Device {
-        profile: "test".into(),
-        manufacturer: String::new(),
-        model: String::new(),
-        source: String::new(),
-        identify: None,
-        wire: Wire {
-            limits: WireLimits::default(),
-            readable: Vec::new(),
-            forbidden: Vec::new(),
-            intervals: Default::default(),
-            response_timeout: None,
-            quirks: Quirks::default(),
-            watchdog: None,
-        },
-        points: vec![point],
-        left_out: Vec::new(),
-    }
+    let mut point = point("point", at, Poll::Fast);
+    point.encoding = Encoding::Plain(form);
+    point.write = Some(Write { at, with: None, rule });
+    device_of(vec![point])
 }
 
 fn registers(count: u16) -> Address {

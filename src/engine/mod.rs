@@ -34,3 +34,6 @@ pub mod topics;
 // Obey: commands, and the bus that ties all of it together.
 pub mod bus;
 pub mod command;
+
+#[cfg(test)]
+pub mod test_device;

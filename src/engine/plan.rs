@@ -1,1 +1,234 @@
+//! A device's points to the cheapest safe reads.
+//!
+//! Within one poll class and one table the points are sorted by address, and a dynamic programme
+//! finds where to cut: a second request costs its frames, the silence and the device's turnaround;
+//! reading over a gap costs its bytes. No cut and no read breaks a limit, leaves a readable range,
+//! touches a forbidden span, splits a value, or reads over a gap that the device once refused.
 
+use std::fmt;
+
+use crate::engine::address::{Address, Span};
+use crate::engine::device::{Device, PointIndex, Poll};
+use crate::engine::settings::{Line, Link};
+use crate::engine::time::Duration;
+
+/// One read and what it is for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Read {
+    pub poll: Poll,
+    pub span: Span,
+    /// The points in it, by address, each with the place from which this read takes it.
+    pub points: Vec<(PointIndex, Address)>,
+    /// Reading it changes the device, so nothing else travels with it.
+    pub alone: bool,
+}
+
+impl Read {
+    /// The runs of addresses inside the span that no point needs.
+    pub fn gaps(&self) -> Vec<Span> {
+        let mut gaps = Vec::new();
+        let mut next = u32::from(self.span.first());
+        for (_, address) in &self.points {
+            let first = u32::from(address.span.first());
+            if first > next {
+                gaps.extend(Span::new(self.span.table(), next as u16, (first - 1) as u16));
+            }
+            next = next.max(u32::from(address.span.last()) + 1);
+        }
+        gaps
+    }
+}
+
+/// What the wire charges, in microseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Cost {
+    /// Everything about a request but its data: both frames' other characters, the silence before
+    /// them, the device's turnaround.
+    pub request: u64,
+    /// Each byte of data.
+    pub byte: u64,
+}
+
+impl Cost {
+    /// The cost on this link with a device that takes `turnaround` to begin its answer.
+    pub fn of(link: &Link, turnaround: Duration) -> Cost {
+        match link {
+            Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } => Cost::of_line(*line, turnaround),
+            // A round trip costs as much as some hundred registers.
+            Link::Tcp { .. } => Cost { request: 500 + turnaround.as_micros() as u64, byte: 1 },
+        }
+    }
+
+    fn of_line(line: Line, turnaround: Duration) -> Cost {
+        // Request: unit, function, address, count, checksum. Answer: unit, function, count, checksum.
+        let frames = line.characters(8 + 5);
+        let request = frames + line.frame_gap() + turnaround;
+        Cost { request: request.as_micros() as u64, byte: line.characters(1).as_micros() as u64 }
+    }
+
+    /// How long reading `span` takes, in microseconds.
+    pub fn of_read(self, span: Span) -> u64 {
+        let data = if span.table().is_bits() { span.count().div_ceil(8) } else { span.count() * 2 };
+        self.request + u64::from(data) * self.byte
+    }
+}
+
+/// The cheapest safe reads of `device`, by poll class, table and address. `refused` are spans that
+/// the device has answered with an exception: no read goes over one that no point needs.
+pub fn plan(device: &Device, cost: Cost, refused: &[Span]) -> Vec<Read> {
+    let mut places: Vec<Address> = device.points.iter().map(|point| point.at).collect();
+    let mut best = plan_at(device, &places, cost, refused);
+    // The same value may stand in two places (relay states as coils and as bits of a register). All
+    // points that have the same two tables move together: half of them elsewhere gains nothing.
+    for moved in groups_with_a_second_place(device) {
+        let mut elsewhere = places.clone();
+        for point in moved {
+            elsewhere[point] = device.points[point].also.unwrap_or(places[point]);
+        }
+        let candidate = plan_at(device, &elsewhere, cost, refused);
+        if total(&candidate, cost) < total(&best, cost) {
+            (best, places) = (candidate, elsewhere);
+        }
+    }
+    best
+}
+
+fn total(reads: &[Read], cost: Cost) -> u64 {
+    reads.iter().map(|read| cost.of_read(read.span)).sum()
+}
+
+fn groups_with_a_second_place(device: &Device) -> Vec<Vec<PointIndex>> {
+    let mut groups: Vec<(_, Vec<PointIndex>)> = Vec::new();
+    for (index, point) in device.points.iter().enumerate() {
+        let Some(also) = point.also else { continue };
+        let key = (point.poll, point.at.span.table(), also.span.table());
+        match groups.iter_mut().find(|(other, _)| *other == key) {
+            Some((_, members)) => members.push(index),
+            None => groups.push((key, vec![index])),
+        }
+    }
+    groups.into_iter().map(|(_, members)| members).collect()
+}
+
+fn plan_at(device: &Device, places: &[Address], cost: Cost, refused: &[Span]) -> Vec<Read> {
+    let mut reads = Vec::new();
+    for poll in [Poll::Fast, Poll::Slow, Poll::Once] {
+        let mut wanted: Vec<(PointIndex, Address)> = (0..device.points.len())
+            .filter(|index| device.points[*index].poll == poll)
+            .map(|index| (index, places[index]))
+            .collect();
+        wanted.sort_by_key(|(index, address)| (address.span, address.bits, *index));
+        let (alone, together): (Vec<_>, Vec<_>) =
+            wanted.into_iter().partition(|(index, _)| device.points[*index].read_clears);
+        let mut of_class = together_by_span(poll, alone, true);
+        for table in crate::engine::address::Table::ALL {
+            let of_table: Vec<_> =
+                together.iter().copied().filter(|(_, address)| address.span.table() == table).collect();
+            of_class.extend(cut(device, poll, &of_table, cost, refused));
+        }
+        of_class.sort_by_key(|read| read.span);
+        reads.extend(of_class);
+    }
+    reads
+}
+
+/// Points whose reading changes the device: one read for each span, shared only by fields of the
+/// same register.
+fn together_by_span(poll: Poll, points: Vec<(PointIndex, Address)>, alone: bool) -> Vec<Read> {
+    let mut reads: Vec<Read> = Vec::new();
+    for (index, address) in points {
+        match reads.last_mut() {
+            Some(read) if read.span == address.span => read.points.push((index, address)),
+            _ => reads.push(Read { poll, span: address.span, points: vec![(index, address)], alone }),
+        }
+    }
+    reads
+}
+
+/// The cheapest partition of sorted points of one table: `cheapest[end]` is the cost of reading the
+/// first `end` points, and where the last of those reads begins.
+fn cut(
+    device: &Device,
+    poll: Poll,
+    points: &[(PointIndex, Address)],
+    cost: Cost,
+    refused: &[Span],
+) -> Vec<Read> {
+    let mut cheapest: Vec<(u64, usize)> = vec![(0, 0)];
+    for end in 1..=points.len() {
+        let mut best = (u64::MAX, end - 1);
+        for begin in (0..end).rev() {
+            let read = read_of(poll, &points[begin..end]);
+            if begin + 1 < end && !may_be_one_read(device, &read, refused) {
+                // A longer read contains this one, and breaks the same rule. (Points are sorted by
+                // their first address, so going back only widens the read.)
+                break;
+            }
+            let before = cheapest[begin].0;
+            let total = before.saturating_add(cost.of_read(read.span));
+            if total < best.0 {
+                best = (total, begin);
+            }
+        }
+        cheapest.push(best);
+    }
+    let mut reads = Vec::new();
+    let mut end = points.len();
+    while end > 0 {
+        let begin = cheapest[end].1;
+        reads.push(read_of(poll, &points[begin..end]));
+        end = begin;
+    }
+    reads.reverse();
+    reads
+}
+
+fn read_of(poll: Poll, points: &[(PointIndex, Address)]) -> Read {
+    let mut span = points[0].1.span;
+    for (_, address) in points {
+        span = span.hull(address.span).unwrap_or(span);
+    }
+    Read { poll, span, points: points.to_vec(), alone: false }
+}
+
+/// Whether several points may travel in one read. (A single one always may: the profile's check has
+/// seen to that.)
+fn may_be_one_read(device: &Device, read: &Read, refused: &[Span]) -> bool {
+    let wire = &device.wire;
+    let limit = if read.span.table().is_bits() { wire.limits.read_bits } else { wire.limits.read_registers };
+    let gaps = read.gaps();
+    read.span.count() <= u32::from(limit)
+        && (wire.readable.is_empty() || wire.readable.iter().any(|range| range.contains(read.span)))
+        && !wire.forbidden.iter().any(|forbidden| forbidden.span.overlaps(read.span))
+        && !device.points.iter().any(|point| point.read_clears && point.at.span.overlaps(read.span))
+        && wire.limits.gap.is_none_or(|widest| gaps.iter().all(|gap| gap.count() <= u32::from(widest)))
+        && !gaps.iter().any(|gap| refused.iter().any(|span| span.overlaps(*gap)))
+}
+
+/// The plan as a table for people, a line a read.
+pub struct Table<'p> {
+    pub device: &'p Device,
+    pub reads: &'p [Read],
+}
+
+impl fmt::Display for Table<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for read in self.reads {
+            let unit = if read.span.table().is_bits() { "bits" } else { "regs" };
+            let range = format!("{}..{}", read.span.first(), read.span.last());
+            write!(f, "{:5} {:9}", read.poll.name(), read.span.table())?;
+            write!(f, "{range:>13} {:>4} {unit}  ", read.span.count())?;
+            let name = |index: usize| self.device.points[read.points[index].0].name.as_str();
+            match read.points.len() {
+                1 => write!(f, "{}", name(0))?,
+                count => write!(f, "{} .. {} ({count})", name(0), name(count - 1))?,
+            }
+            writeln!(f, "{}", if read.alone { "  alone: reading changes it" } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[path = "plan_tests.rs"]
+mod tests;

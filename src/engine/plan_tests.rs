@@ -1,0 +1,154 @@
+//! The planner against tables and against brute force.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::engine::address::Table as RegisterTable;
+use crate::engine::device::{Forbidden, Limits, Wire};
+use crate::engine::settings::Parity;
+use crate::engine::test_device::{device_of, point};
+
+const LINE: Line = Line { baud: 19200, parity: Parity::Even, stop_bits: 1 };
+
+fn cost() -> Cost {
+    Cost::of_line(LINE, Duration::from_millis(5))
+}
+
+fn span(table: RegisterTable, first: u16, last: u16) -> Span {
+    Span::new(table, first, last).expect("a span")
+}
+
+/// A device with one fast point for each `first, count`, and this wire.
+fn device(places: &[(u16, u16)], change: impl FnOnce(&mut Wire)) -> Device {
+    let points = places
+        .iter()
+        .enumerate()
+        .map(|(index, (first, count))| {
+            let span = Span::with_count(RegisterTable::Input, *first, *count).expect("a span");
+            point(&format!("p{index}"), Address { span, bits: None }, Poll::Fast)
+        })
+        .collect();
+    let mut device = device_of(points);
+    change(&mut device.wire);
+    device
+}
+
+fn check(device: &Device, refused: &[Span], expected: &[&str]) {
+    let reads: Vec<String> = plan(device, cost(), refused).iter().map(|read| read.span.to_string()).collect();
+    assert_eq!(reads, expected);
+}
+
+#[test]
+fn near_points_share_a_read_and_far_ones_do_not() {
+    check(&device(&[(0, 1), (4, 1)], |_| {}), &[], &["input 0..4"]);
+    check(&device(&[(0, 1), (200, 1)], |_| {}), &[], &["input 0", "input 200"]);
+    check(&device(&[(0, 1), (4, 1)], |wire| wire.limits.gap = Some(2)), &[], &["input 0", "input 4"]);
+    check(&device(&[(0, 1), (1, 1)], |wire| wire.limits.gap = Some(0)), &[], &["input 0..1"]);
+}
+
+#[test]
+fn a_gap_that_was_refused_is_not_bridged_again() {
+    let device = device(&[(0, 1), (2, 1), (4, 1)], |_| {});
+    check(&device, &[], &["input 0..4"]);
+    check(&device, &[Span::single(RegisterTable::Input, 1)], &["input 0", "input 2..4"]);
+}
+
+#[test]
+fn limits_ranges_and_forbidden_spans_are_kept() {
+    let ten: Vec<(u16, u16)> = (0..10).map(|first| (first, 1)).collect();
+    check(
+        &device(&ten, |wire| wire.limits = Limits { read_registers: 4, ..wire.limits }),
+        &[],
+        &["input 0..1", "input 2..5", "input 6..9"],
+    );
+    let forbid = |wire: &mut Wire| {
+        wire.forbidden =
+            vec![Forbidden { span: span(RegisterTable::Input, 1, 2), reason: "a test says so".into() }];
+    };
+    check(&device(&[(0, 1), (3, 1)], forbid), &[], &["input 0", "input 3"]);
+    let ranges = |wire: &mut Wire| {
+        wire.readable = vec![span(RegisterTable::Input, 0, 1), span(RegisterTable::Input, 2, 9)];
+    };
+    check(&device(&[(0, 1), (1, 1), (2, 1), (3, 1)], ranges), &[], &["input 0..1", "input 2..3"]);
+}
+
+#[test]
+fn a_value_that_clears_when_read_travels_alone() {
+    let mut device = device(&[(0, 1), (1, 1), (2, 1)], |_| {});
+    device.points[1].read_clears = true;
+    check(&device, &[], &["input 0", "input 1", "input 2"]);
+}
+
+#[test]
+fn a_value_in_two_places_is_read_from_the_cheaper_one() {
+    let mut device = device(&(1..=8).map(|first| (first, 1)).collect::<Vec<_>>(), |_| {});
+    for (bit, point) in device.points.iter_mut().enumerate() {
+        point.also = Some(Address {
+            span: Span::single(RegisterTable::Input, 9),
+            bits: crate::engine::address::Bits::new(bit as u8, bit as u8),
+        });
+    }
+    check(&device, &[], &["input 9"]);
+}
+
+/// Every way to cut the sorted points into runs; the cost of the cheapest that keeps the rules.
+fn brute_force(device: &Device, refused: &[Span]) -> u64 {
+    let mut points: Vec<(PointIndex, Address)> =
+        device.points.iter().enumerate().map(|(index, point)| (index, point.at)).collect();
+    points.sort_by_key(|(index, address)| (address.span, address.bits, *index));
+    let cuts = points.len() - 1;
+    (0..1u32 << cuts)
+        .filter_map(|pattern| {
+            let mut total = 0;
+            let mut begin = 0;
+            for end in 1..=points.len() {
+                if end < points.len() && pattern & (1 << (end - 1)) == 0 {
+                    continue;
+                }
+                let read = read_of(Poll::Fast, &points[begin..end]);
+                if end - begin > 1 && !may_be_one_read(device, &read, refused) {
+                    return None;
+                }
+                total += cost().of_read(read.span);
+                begin = end;
+            }
+            Some(total)
+        })
+        .min()
+        .expect("reading every point by itself is always possible")
+}
+
+proptest! {
+    #[test]
+    fn no_plan_is_cheaper_and_each_point_is_read_once(
+        places in prop::collection::vec((0u16..60, 1u16..4), 1..9),
+        limit in 4u16..30,
+        gap in prop::option::of(0u16..12),
+        forbidden in prop::option::of((0u16..60, 0u16..4)),
+        refused in prop::option::of((0u16..60, 0u16..4)),
+    ) {
+        let at = |(first, more): (u16, u16)| span(RegisterTable::Input, first, first + more);
+        let device = device(&places, |wire| {
+            wire.limits.read_registers = limit;
+            wire.limits.gap = gap;
+            // The profile's check refuses points inside a forbidden span, so only what is free is forbidden.
+            wire.forbidden = forbidden.map(at).into_iter()
+                .filter(|span| !places.iter().any(|(first, count)| {
+                    Span::with_count(RegisterTable::Input, *first, *count).expect("a span").overlaps(*span)
+                }))
+                .map(|span| Forbidden { span, reason: String::new() }).collect();
+        });
+        let refused: Vec<Span> = refused.map(at).into_iter().collect();
+        let reads = plan(&device, cost(), &refused);
+        prop_assert_eq!(total(&reads, cost()), brute_force(&device, &refused));
+        let mut read_points: Vec<PointIndex> =
+            reads.iter().flat_map(|read| read.points.iter().map(|(point, _)| *point)).collect();
+        read_points.sort_unstable();
+        prop_assert_eq!(read_points, (0..places.len()).collect::<Vec<_>>());
+        for read in &reads {
+            prop_assert!(read.points.iter().all(|(_, address)| read.span.contains(address.span)));
+            prop_assert!(!device.wire.forbidden.iter().any(|forbidden| forbidden.span.overlaps(read.span)));
+            prop_assert!(read.points.len() == 1 || read.span.count() <= u32::from(limit));
+        }
+    }
+}
