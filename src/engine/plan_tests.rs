@@ -59,7 +59,7 @@ fn limits_ranges_and_forbidden_spans_are_kept() {
     check(
         &device(&ten, |wire| wire.limits = Limits { read_registers: 4, ..wire.limits }),
         &[],
-        &["input 0..1", "input 2..5", "input 6..9"],
+        &["input 0..3", "input 4..7", "input 8..9"],
     );
     let forbid = |wire: &mut Wire| {
         wire.forbidden =

@@ -1,1 +1,227 @@
+//! Which read of a bus is next: the one that is furthest past its period.
+//!
+//! Urgency is the time since a read last began, divided by its period. On a bus that cannot keep up
+//! every period therefore stretches by the same factor, and nothing starves. Reads that are wanted at
+//! once (after a connect, after a write, on request) come before all of them, selectors first.
 
+use crate::engine::address::Span;
+use crate::engine::device::{Intervals, PointIndex, Poll};
+use crate::engine::plan::Read;
+use crate::engine::time::{Duration, Time};
+
+/// The reads of one device, and when each is wanted.
+#[derive(Clone, Debug)]
+pub struct Polls {
+    reads: Vec<Planned>,
+}
+
+#[derive(Clone, Debug)]
+struct Planned {
+    read: Read,
+    /// `None`: only after a connect or on request.
+    period: Option<Duration>,
+    /// Some point in it decides how others are read.
+    has_selector: bool,
+    began_at: Option<Time>,
+    wanted_now: bool,
+    /// Has ended, well or badly, since the device connected.
+    tried: bool,
+    /// Answered with an exception: not asked again before.
+    paused_until: Time,
+}
+
+/// How much a read is wanted; the greatest is next.
+#[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
+pub enum Urgency {
+    /// Time since it last began ÷ its period, at least 1.
+    Overdue(f64),
+    Wanted,
+    WantedSelector,
+}
+
+impl Polls {
+    /// All of `reads`, each wanted at once. `is_selector` tells the points that others wait for.
+    pub fn new(reads: Vec<Read>, intervals: Intervals, is_selector: impl Fn(PointIndex) -> bool) -> Polls {
+        let planned = |read: Read| Planned {
+            period: match read.poll {
+                Poll::Fast => Some(intervals.fast),
+                Poll::Slow => Some(intervals.slow),
+                Poll::Once | Poll::Never => None,
+            },
+            has_selector: read.points.iter().any(|(point, _)| is_selector(*point)),
+            read,
+            began_at: None,
+            wanted_now: true,
+            tried: false,
+            paused_until: Time::default(),
+        };
+        Polls { reads: reads.into_iter().map(planned).collect() }
+    }
+
+    pub fn read(&self, index: usize) -> &Read {
+        &self.reads[index].read
+    }
+
+    pub fn reads(&self) -> impl Iterator<Item = &Read> {
+        self.reads.iter().map(|planned| &planned.read)
+    }
+
+    /// The most urgent read that may begin now.
+    pub fn most_urgent(&self, now: Time) -> Option<(usize, Urgency)> {
+        let mut best: Option<(usize, Urgency)> = None;
+        for (index, planned) in self.reads.iter().enumerate() {
+            let Some(urgency) = planned.urgency(now) else { continue };
+            if best.is_none_or(|(_, greatest)| urgency > greatest) {
+                best = Some((index, urgency));
+            }
+        }
+        best
+    }
+
+    /// When the next read will be due, if nothing asks for one before.
+    pub fn due_at(&self) -> Option<Time> {
+        self.reads.iter().filter_map(Planned::due_at).min()
+    }
+
+    /// The read has been sent.
+    pub fn begin(&mut self, index: usize, now: Time) {
+        let planned = &mut self.reads[index];
+        planned.began_at = Some(now);
+        planned.wanted_now = false;
+    }
+
+    /// The read has ended, well or badly.
+    pub fn end(&mut self, index: usize) {
+        self.reads[index].tried = true;
+    }
+
+    /// The read was refused by the device: ask again later than usual.
+    pub fn pause(&mut self, index: usize, until: Time) {
+        self.reads[index].paused_until = until;
+    }
+
+    /// Every read that holds `point` is wanted at once.
+    pub fn want(&mut self, point: PointIndex) {
+        for planned in &mut self.reads {
+            if planned.read.points.iter().any(|(held, _)| *held == point) {
+                planned.wanted_now = true;
+                planned.paused_until = Time::default();
+            }
+        }
+    }
+
+    /// The device has (re)connected: everything is wanted again.
+    pub fn want_all(&mut self) {
+        for planned in &mut self.reads {
+            planned.wanted_now = true;
+            planned.tried = false;
+            planned.paused_until = Time::default();
+        }
+    }
+
+    /// Whether each read has been tried since the connect.
+    pub fn first_round_is_over(&self) -> bool {
+        self.reads.iter().all(|planned| planned.tried)
+    }
+
+    /// Takes over the reads of a new plan; what both plans have in common keeps its times, and only
+    /// what is new is wanted at once.
+    pub fn replace(
+        &mut self,
+        reads: Vec<Read>,
+        intervals: Intervals,
+        is_selector: impl Fn(PointIndex) -> bool,
+    ) {
+        let old = std::mem::replace(self, Polls::new(reads, intervals, is_selector));
+        let known = |span: Span, poll: Poll| {
+            old.reads.iter().find(|planned| planned.read.span == span && planned.read.poll == poll)
+        };
+        for planned in &mut self.reads {
+            if let Some(before) = known(planned.read.span, planned.read.poll) {
+                planned.began_at = before.began_at;
+                planned.wanted_now = before.wanted_now;
+                planned.tried = before.tried;
+                planned.paused_until = before.paused_until;
+            }
+        }
+    }
+}
+
+impl Planned {
+    fn urgency(&self, now: Time) -> Option<Urgency> {
+        if now < self.paused_until {
+            return None;
+        }
+        if self.wanted_now {
+            return Some(if self.has_selector { Urgency::WantedSelector } else { Urgency::Wanted });
+        }
+        let (period, began_at) = (self.period?, self.began_at?);
+        let waited = now - began_at;
+        (waited >= period).then(|| Urgency::Overdue(waited.as_secs_f64() / period.as_secs_f64().max(1e-6)))
+    }
+
+    fn due_at(&self) -> Option<Time> {
+        let due = if self.wanted_now { Time::default() } else { self.began_at? + self.period? };
+        Some(due.max(self.paused_until))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::address::{Address, Table};
+
+    fn polls(periods: &[Poll]) -> Polls {
+        let reads = periods
+            .iter()
+            .enumerate()
+            .map(|(index, poll)| {
+                let span = Span::single(Table::Input, index as u16 * 100);
+                Read { poll: *poll, span, points: vec![(index, Address { span, bits: None })], alone: false }
+            })
+            .collect();
+        let intervals = Intervals { fast: Duration::from_millis(100), slow: Duration::from_millis(1000) };
+        Polls::new(reads, intervals, |point| point == 2)
+    }
+
+    /// Runs the schedule on a wire where each read takes `cost`; returns how often each was read.
+    fn run(polls: &mut Polls, cost: Duration, until: Time) -> Vec<u32> {
+        let mut counts = vec![0; polls.reads.len()];
+        let mut now = Time::default();
+        while now < until {
+            match polls.most_urgent(now) {
+                Some((index, _)) => {
+                    polls.begin(index, now);
+                    polls.end(index);
+                    counts[index] += 1;
+                    now += cost;
+                }
+                None => now = polls.due_at().expect("a period"),
+            }
+        }
+        counts
+    }
+
+    #[test]
+    fn every_period_is_kept_on_a_bus_with_time_to_spare() {
+        let mut polls = polls(&[Poll::Fast, Poll::Slow, Poll::Once]);
+        assert_eq!(run(&mut polls, Duration::from_millis(5), Time::from_millis(10_000)), [100, 10, 1]);
+    }
+
+    #[test]
+    fn an_overloaded_bus_stretches_every_period_by_the_same_factor() {
+        let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
+        // Demand: 21 reads a second; the wire carries ten. Both classes get a little under half.
+        let counts = run(&mut polls, Duration::from_millis(100), Time::from_millis(100_000));
+        assert_eq!(counts.iter().sum::<u32>(), 1000);
+        let fast_stretch = 1000.0 / f64::from(counts[0]);
+        let slow_stretch = 100.0 / f64::from(counts[2]);
+        assert!((fast_stretch / slow_stretch - 1.0).abs() < 0.1, "{counts:?}");
+    }
+
+    #[test]
+    fn selectors_come_before_what_depends_on_them() {
+        let polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
+        assert_eq!(polls.most_urgent(Time::default()), Some((2, Urgency::WantedSelector)));
+    }
+}

@@ -1,1 +1,179 @@
+//! What is known of a device's points, and what of it is worth telling.
 
+use crate::engine::codec::{self, Raw};
+use crate::engine::device::{Device, Point, PointIndex};
+use crate::engine::plan::Read;
+use crate::engine::time::{Duration, Time};
+use crate::engine::value::{Missing, Reading};
+
+/// The last reading of each point of one device.
+#[derive(Clone, Debug)]
+pub struct Values {
+    values: Vec<Value>,
+    /// The raw fields by which other points are read; see [`codec::resolve`].
+    known: Vec<Option<i128>>,
+    /// For each point, those that it decides.
+    dependents: Vec<Vec<PointIndex>>,
+}
+
+#[derive(Clone, Debug)]
+struct Value {
+    reading: Reading,
+    read_at: Option<Time>,
+    told: Option<(Reading, Time)>,
+}
+
+/// What a read has brought.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Absorbed {
+    /// Points whose interpretation has changed with a selector; their readings have been dropped.
+    pub dropped: Vec<PointIndex>,
+    /// Points that hold a register value which the profile does not name, seen for the first time.
+    pub unnamed: Vec<(PointIndex, i128)>,
+}
+
+impl Values {
+    /// Nothing is known yet.
+    pub fn new(device: &Device) -> Values {
+        let count = device.points.len();
+        let mut dependents = vec![Vec::new(); count];
+        for (index, point) in device.points.iter().enumerate() {
+            for selector in point.selectors() {
+                dependents[selector].push(index);
+            }
+        }
+        let unknown = Value { reading: Reading::Missing(Missing::NotYetRead), read_at: None, told: None };
+        Values { values: vec![unknown; count], known: vec![None; count], dependents }
+    }
+
+    /// What the selectors say, for [`codec::resolve`].
+    pub fn known(&self) -> &[Option<i128>] {
+        &self.known
+    }
+
+    pub fn reading(&self, point: PointIndex) -> &Reading {
+        &self.values[point].reading
+    }
+
+    pub fn read_at(&self, point: PointIndex) -> Option<Time> {
+        self.values[point].read_at
+    }
+
+    /// Whether other points wait for this one.
+    pub fn is_selector(&self, point: PointIndex) -> bool {
+        !self.dependents[point].is_empty()
+    }
+
+    /// Takes in the words of a read that began after every write before it. Selectors come first:
+    /// what a selector decides is never understood by what it said before.
+    pub fn absorb(&mut self, now: Time, device: &Device, read: &Read, words: &[u16]) -> Absorbed {
+        let mut absorbed = Absorbed::default();
+        let (selectors, others): (Vec<_>, Vec<_>) =
+            read.points.iter().copied().partition(|(point, _)| self.is_selector(*point));
+        for (point, address) in selectors.into_iter().chain(others) {
+            let Some(field) = codec::words_at(address, read.span.first(), words) else { continue };
+            let known = known_field(&device.points[point], &field);
+            if self.is_selector(point) && self.known[point] != known {
+                self.known[point] = known;
+                self.drop_dependents(device, point, &mut absorbed.dropped);
+            }
+            let reading = match codec::resolve(device, point, &self.known) {
+                Ok(resolved) => codec::read(&resolved, &field),
+                Err(missing) => Reading::Missing(missing),
+            };
+            if let Reading::Missing(Missing::UnknownValue(raw)) = reading {
+                if self.values[point].reading != reading {
+                    absorbed.unnamed.push((point, raw));
+                }
+            }
+            self.values[point].reading = reading;
+            self.values[point].read_at = Some(now);
+            absorbed.dropped.retain(|dropped| *dropped != point);
+        }
+        absorbed
+    }
+
+    /// A write to `point` is on its way: whatever it decides is not understood until it has been read
+    /// back.
+    pub fn forget_selector(&mut self, device: &Device, point: PointIndex) {
+        if self.is_selector(point) {
+            self.known[point] = None;
+            self.drop_dependents(device, point, &mut Vec::new());
+        }
+    }
+
+    fn drop_dependents(&mut self, device: &Device, selector: PointIndex, dropped: &mut Vec<PointIndex>) {
+        for dependent in self.dependents[selector].clone() {
+            let missing = match codec::resolve(device, dependent, &self.known) {
+                Ok(_) => Missing::NotYetRead,
+                Err(missing) => missing,
+            };
+            self.values[dependent].reading = Reading::Missing(missing);
+            if !dropped.contains(&dependent) {
+                dropped.push(dependent);
+            }
+            if self.is_selector(dependent) {
+                self.known[dependent] = None;
+                self.drop_dependents(device, dependent, dropped);
+            }
+        }
+    }
+
+    /// There is no reading of this point now.
+    pub fn lose(&mut self, point: PointIndex, missing: Missing) {
+        self.values[point].reading = Reading::Missing(missing);
+    }
+
+    /// The device is gone, and with it everything that was known of it.
+    pub fn lose_all(&mut self, missing: Missing) {
+        self.known.fill(None);
+        for value in &mut self.values {
+            value.reading = Reading::Missing(missing.clone());
+        }
+    }
+
+    /// The text to publish for this point now: if it differs from what was told last (by at least the
+    /// deadband), if what was told is older than `republish`, or if `anyway`.
+    pub fn tell(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        details: &Point,
+        republish: Duration,
+        anyway: bool,
+    ) -> Option<String> {
+        let value = &mut self.values[point];
+        let worth_telling = match &value.told {
+            None => true,
+            Some((told, told_at)) => {
+                anyway || now - *told_at >= republish || differs(told, &value.reading, details)
+            }
+        };
+        if !worth_telling {
+            return None;
+        }
+        value.told = Some((value.reading.clone(), now));
+        Some(value.reading.to_string())
+    }
+}
+
+/// The raw integer of a selector; `None` when its words are invalid.
+fn known_field(point: &Point, field: &[u16]) -> Option<i128> {
+    match codec::raw(point.plain()?, field) {
+        Raw::Integer(raw) => Some(raw),
+        _ => None,
+    }
+}
+
+fn differs(told: &Reading, reading: &Reading, point: &Point) -> bool {
+    let number = |reading: &Reading| match reading {
+        Reading::Number(number) => Some(number.to_f64()),
+        Reading::Float(number) => Some(*number),
+        _ => None,
+    };
+    match (number(told), number(reading), point.deadband) {
+        (Some(before), Some(after), Some(deadband)) => (after - before).abs() >= deadband.to_f64(),
+        // Compared as told: the reason why something is missing belongs to the device's info.
+        _ => told.to_string() != reading.to_string(),
+    }
+}
