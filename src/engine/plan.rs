@@ -160,9 +160,12 @@ fn cut(
         for begin in (0..end).rev() {
             let read = read_of(poll, &points[begin..end]);
             if begin + 1 < end && !may_be_one_read(device, &read, refused) {
-                // A longer read contains this one, and breaks the same rule. (Points are sorted by
-                // their first address, so going back only widens the read.)
-                break;
+                if read.span.count() > limit(device, read.span) {
+                    // Going further back only widens the read. (A gap, however, may vanish when a wide
+                    // value covers it.)
+                    break;
+                }
+                continue;
             }
             let before = cheapest[begin].0;
             let total = before.saturating_add(cost.of_read(read.span));
@@ -195,14 +198,18 @@ fn read_of(poll: Poll, points: &[(PointIndex, Address)]) -> Read {
 /// seen to that.)
 fn may_be_one_read(device: &Device, read: &Read, refused: &[Span]) -> bool {
     let wire = &device.wire;
-    let limit = if read.span.table().is_bits() { wire.limits.read_bits } else { wire.limits.read_registers };
     let gaps = read.gaps();
-    read.span.count() <= u32::from(limit)
+    read.span.count() <= limit(device, read.span)
         && (wire.readable.is_empty() || wire.readable.iter().any(|range| range.contains(read.span)))
         && !wire.forbidden.iter().any(|forbidden| forbidden.span.overlaps(read.span))
         && !device.points.iter().any(|point| point.read_clears && point.at.span.overlaps(read.span))
         && wire.limits.gap.is_none_or(|widest| gaps.iter().all(|gap| gap.count() <= u32::from(widest)))
         && !gaps.iter().any(|gap| refused.iter().any(|span| span.overlaps(*gap)))
+}
+
+fn limit(device: &Device, span: Span) -> u32 {
+    let limits = &device.wire.limits;
+    u32::from(if span.table().is_bits() { limits.read_bits } else { limits.read_registers })
 }
 
 /// The plan as a table for people, a line a read.
