@@ -1,0 +1,306 @@
+//! Nodes to typed values, strictly.
+
+use std::ops::Deref;
+
+use serde_json::{Map as JsonMap, Value as Json, json};
+
+use crate::engine::yaml::{Content, Definitions, Faults, Node, Place, Scalar};
+
+/// A type that can stand in a file.
+pub trait Read: Sized {
+    /// Reads `node`. Every fault in it is noted; `None` if nothing can be made of it. A value may
+    /// come back although there are faults (a [`Map`] without its bad entries): whoever reads a
+    /// whole file asks [`Faults::is_empty`] at the end.
+    fn read(node: &Node, faults: &mut Faults) -> Option<Self>;
+
+    /// The value where the key is left out; `None` if it must be there.
+    fn absent() -> Option<Self> {
+        None
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json;
+}
+
+/// Reads `node` as a `T`: [`Read::read`] where the type is known from what is done with it.
+pub fn read<T: Read>(node: &Node, faults: &mut Faults) -> Option<T> {
+    T::read(node, faults)
+}
+
+impl<T: Scalar> Read for T {
+    fn read(node: &Node, faults: &mut Faults) -> Option<T> {
+        let result = match (&node.content, node.is_null()) {
+            (Content::Scalar { text, .. }, false) => T::parse(text),
+            _ => Err(format!("{} stands here; expected {}", node.found(), T::EXPECTED)),
+        };
+        result.map_err(|message| faults.add(&node.place, message)).ok()
+    }
+
+    fn schema(_: &mut Definitions) -> Json {
+        T::schema()
+    }
+}
+
+/// May be left out; `null` says the same.
+impl<T: Read> Read for Option<T> {
+    fn read(node: &Node, faults: &mut Faults) -> Option<Option<T>> {
+        if node.is_null() { Some(None) } else { T::read(node, faults).map(Some) }
+    }
+
+    fn absent() -> Option<Option<T>> {
+        Some(None)
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        json!({"anyOf": [T::schema(definitions), {"type": "null"}]})
+    }
+}
+
+impl<T: Read> Read for Vec<T> {
+    fn read(node: &Node, faults: &mut Faults) -> Option<Vec<T>> {
+        match &node.content {
+            Content::List(items) => {
+                let read: Vec<Option<T>> = items.iter().map(|item| T::read(item, faults)).collect();
+                read.into_iter().collect()
+            }
+            _ => {
+                faults
+                    .add(&node.place, format!("{} stands here; expected a list like `[…, …]`", node.found()));
+                None
+            }
+        }
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        json!({"type": "array", "items": T::schema(definitions)})
+    }
+}
+
+/// A value together with its place, for checks that come after the reading.
+#[derive(Clone, Debug)]
+pub struct At<T> {
+    pub value: T,
+    pub place: Place,
+}
+
+impl<T> At<T> {
+    /// A default, which stands in no file.
+    pub fn nowhere(value: T) -> At<T> {
+        At { value, place: Place::nowhere() }
+    }
+}
+
+impl<T> Deref for At<T> {
+    type Target = T;
+    fn deref(&self) -> &T {
+        &self.value
+    }
+}
+
+impl<T: Read> Read for At<T> {
+    fn read(node: &Node, faults: &mut Faults) -> Option<At<T>> {
+        Some(At { value: T::read(node, faults)?, place: node.place.clone() })
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        T::schema(definitions)
+    }
+}
+
+/// Entries in the file's order, each read by itself.
+#[derive(Clone, Debug)]
+pub struct Map<K, V> {
+    pub entries: Vec<(At<K>, V)>,
+    /// Keys whose values had faults, so that nobody calls them unknown as well.
+    pub unread: Vec<At<K>>,
+}
+
+impl<K, V> Default for Map<K, V> {
+    fn default() -> Map<K, V> {
+        Map { entries: Vec::new(), unread: Vec::new() }
+    }
+}
+
+impl<K: PartialEq, V> Map<K, V> {
+    pub fn get(&self, key: &K) -> Option<&V> {
+        self.entries.iter().find(|(found, _)| found.value == *key).map(|(_, value)| value)
+    }
+
+    /// Whether `key` stands in the file, read or not.
+    pub fn names(&self, key: &K) -> bool {
+        self.get(key).is_some() || self.unread.iter().any(|found| found.value == *key)
+    }
+}
+
+impl<K, V> Map<K, V> {
+    pub fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+
+    pub fn iter(&self) -> impl Iterator<Item = (&At<K>, &V)> {
+        self.entries.iter().map(|(key, value)| (key, value))
+    }
+}
+
+impl<K: Read + PartialEq, V: Read> Read for Map<K, V> {
+    fn read(node: &Node, faults: &mut Faults) -> Option<Map<K, V>> {
+        let Content::Map(nodes) = &node.content else {
+            faults.add(
+                &node.place,
+                format!("{} stands here; expected a map like `{{key: value}}`", node.found()),
+            );
+            return None;
+        };
+        let mut map = Map::default();
+        for entry in nodes {
+            let value = V::read(&entry.value, faults);
+            let Some(key) = At::<K>::read(&entry.key, faults) else { continue };
+            // `0x10` and `16` are two texts and one key.
+            if map.names(&key.value) {
+                faults.add(
+                    &key.place,
+                    format!("{} is the same as a key above it; remove one of them", entry.key.found()),
+                );
+                continue;
+            }
+            match value {
+                Some(value) => map.entries.push((key, value)),
+                None => map.unread.push(key),
+            }
+        }
+        Some(map)
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        json!({"type": "object", "additionalProperties": V::schema(definitions)})
+    }
+}
+
+/// The keys of a map that shall become a record: what `record!` is made of.
+pub struct Keys<'n> {
+    node: &'n Node,
+}
+
+impl<'n> Keys<'n> {
+    /// Notes every key of `node` that is not `known`; `None` if it is no map at all.
+    pub fn of(node: &'n Node, known: &[&str], faults: &mut Faults) -> Option<Keys<'n>> {
+        let known: Vec<&str> = known.iter().map(|name| plain(name)).collect();
+        let Content::Map(entries) = &node.content else {
+            let some: Vec<String> = known.iter().take(3).map(|name| format!("`{name}`")).collect();
+            let keys =
+                if known.len() > 3 { format!("{} and others", some.join(", ")) } else { some.join(", ") };
+            faults.add(
+                &node.place,
+                format!("{} stands here; expected a map with the keys {keys}", node.found()),
+            );
+            return None;
+        };
+        for entry in entries {
+            let Some(key) = entry.key.text() else {
+                faults.add(&entry.key.place, format!("an empty key; {}", list_of_choices("", &known)));
+                continue;
+            };
+            if !known.contains(&key) {
+                faults
+                    .add(&entry.key.place, format!("unknown key `{key}`; {}", list_of_choices(key, &known)));
+            }
+        }
+        Some(Keys { node })
+    }
+
+    /// The value of the key `name`, or `default`; a missing key without one is a fault.
+    pub fn value<T: Read>(&self, name: &str, default: Option<T>, faults: &mut Faults) -> Option<T> {
+        match (self.node.get(plain(name)), default) {
+            (Some(node), _) => T::read(node, faults),
+            (None, Some(default)) => Some(default),
+            (None, None) => {
+                faults.add(self.node.named_at(), format!("the key `{}` is missing here", plain(name)));
+                None
+            }
+        }
+    }
+
+    /// The JSON Schema of a record.
+    pub fn schema(description: &str, keys: Vec<KeySchema>) -> Json {
+        let mut properties = JsonMap::new();
+        let mut required = Vec::new();
+        for key in keys {
+            let mut schema = key.schema;
+            if let (Json::Object(schema), false) = (&mut schema, key.description.is_empty()) {
+                schema.insert("description".into(), one_line(key.description).into());
+            }
+            properties.insert(plain(key.name).into(), schema);
+            if key.required {
+                required.push(plain(key.name));
+            }
+        }
+        json!({
+            "type": "object",
+            "description": one_line(description),
+            "properties": properties,
+            "required": required,
+            "additionalProperties": false,
+        })
+    }
+}
+
+/// One key of a record, for its schema.
+pub struct KeySchema {
+    pub name: &'static str,
+    pub description: &'static str,
+    pub required: bool,
+    pub schema: Json,
+}
+
+/// The key of a field whose name is a Rust word.
+fn plain(field: &str) -> &str {
+    field.strip_prefix("r#").unwrap_or(field)
+}
+
+fn one_line(documentation: &str) -> String {
+    documentation.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// The remedy for a wrong word: the one that was probably meant, or all that can stand here.
+pub fn list_of_choices(found: &str, choices: &[&str]) -> String {
+    if let Some(meant) = nearest(found, choices) {
+        return format!("did you mean `{meant}`?");
+    }
+    let quoted: Vec<String> = choices.iter().map(|choice| format!("`{choice}`")).collect();
+    match quoted.split_last() {
+        None => "nothing can stand here".into(),
+        Some((only, [])) => format!("expected {only}"),
+        Some((last, others)) => format!("expected {} or {last}", others.join(", ")),
+    }
+}
+
+/// The choice that differs from `found` by a slip of the fingers: one letter in three at most.
+pub fn nearest<'a>(found: &str, choices: &[&'a str]) -> Option<&'a str> {
+    let allowed = found.chars().count().max(2) / 3 + usize::from(found.chars().count() == 2);
+    choices
+        .iter()
+        .map(|choice| (distance(found, choice), *choice))
+        .filter(|(distance, _)| *distance <= allowed)
+        .min_by_key(|(distance, _)| *distance)
+        .map(|(_, choice)| choice)
+}
+
+/// Letters to add, drop or change, and neighbours to swap, until `a` is `b`.
+fn distance(a: &str, b: &str) -> usize {
+    let (a, b): (Vec<char>, Vec<char>) = (a.chars().collect(), b.chars().collect());
+    let mut rows = vec![vec![0; b.len() + 1]; a.len() + 1];
+    for (i, row) in rows.iter_mut().enumerate() {
+        row[0] = i;
+    }
+    rows[0] = (0..=b.len()).collect();
+    for i in 1..=a.len() {
+        for j in 1..=b.len() {
+            let changed = usize::from(a[i - 1] != b[j - 1]);
+            let mut best = (rows[i - 1][j] + 1).min(rows[i][j - 1] + 1).min(rows[i - 1][j - 1] + changed);
+            if i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1] {
+                best = best.min(rows[i - 2][j - 2] + 1);
+            }
+            rows[i][j] = best;
+        }
+    }
+    rows[a.len()][b.len()]
+}
