@@ -1,0 +1,27 @@
+# What a person types. Everything runs from the repository and cleans up after itself.
+
+# Appended to PATH, so that nobody's own programs are hidden.
+WITH_MOSQUITTO = tools=$$(scripts/get-mosquitto) && PATH="$$PATH:$$tools"
+
+.PHONY: demo test test-home-assistant lint goldens
+
+# The whole program without hardware: simulated devices, a broker, the gateway. Ctrl-C ends it.
+demo:
+	@$(WITH_MOSQUITTO) exec cargo run --quiet --locked -- demo
+
+# Every test that needs no large download.
+test:
+	@$(WITH_MOSQUITTO) exec cargo test --locked
+
+# The discovery messages against a real Home Assistant core; downloads about 800 MB the first time.
+test-home-assistant:
+	@$(WITH_MOSQUITTO) exec tests/home-assistant/run
+
+lint:
+	cargo fmt --check
+	cargo clippy --locked --all-targets -- -D warnings
+
+# Rewrites the goldens, the messages of faulty files and the schemas from what the program does now.
+# Read the difference before committing it.
+goldens:
+	BUSKER_REWRITE=1 cargo test --locked
