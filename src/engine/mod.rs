@@ -14,6 +14,7 @@ pub mod configuration;
 pub mod device;
 pub mod profile;
 pub mod settings;
+pub mod units;
 pub mod yaml;
 
 // Ask: requests, replies, and which come when.
