@@ -4,7 +4,28 @@
 //! The tables are those of Home Assistant 2026.11 (`components/sensor/const.py`,
 //! `components/number/const.py`, `components/binary_sensor/__init__.py`).
 
-use crate::engine::device::Platform;
+use crate::engine::device::{Form, Kind, Names, Platform, Point, WriteRule};
+
+/// What a point can be in Home Assistant, read in this form; the first is what it is unless the
+/// profile says `as`. Never empty.
+pub fn platforms(point: &Point, form: &Form) -> &'static [Platform] {
+    let rule = point.write.as_ref().map(|write| &write.rule);
+    let enumeration = matches!(form.names, Names::All(_));
+    match rule {
+        Some(WriteRule::Press { .. }) => &[Platform::Button],
+        None if form.kind == Kind::Bool => &[Platform::BinarySensor],
+        None => &[Platform::Sensor],
+        // Where a single name can be written, a button beside the reading writes it.
+        Some(WriteRule::Names(names)) if names.len() == 1 || !enumeration => match form.kind {
+            Kind::Bool => &[Platform::BinarySensor],
+            _ => &[Platform::Sensor],
+        },
+        Some(_) if form.kind == Kind::Bool => &[Platform::Switch, Platform::BinarySensor],
+        Some(_) if enumeration => &[Platform::Select, Platform::Sensor],
+        Some(_) if form.kind.is_text() => &[Platform::Text, Platform::Sensor],
+        Some(_) => &[Platform::Number, Platform::Sensor],
+    }
+}
 
 /// Checks what a profile or a configuration wishes for an entity of `platform`. `unit` is `None`
 /// where there is none, or where it is not known yet.

@@ -1,0 +1,297 @@
+//! One discovery message for each Modbus device, and the farewell to what it no longer has.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Map, Value, json};
+
+use super::entity::{Entity, companions, entity, sentence};
+use crate::engine::device::Platform;
+use crate::engine::settings::{self, DeviceSettings};
+use crate::engine::topics::{self, Message, Topics};
+
+/// What all announcements of one gateway have in common.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Gateway {
+    pub topics: Topics,
+    /// Where Home Assistant looks: `homeassistant`.
+    pub prefix: String,
+}
+
+impl Gateway {
+    pub fn new(base_topic: &str, home_assistant: &settings::HomeAssistant) -> Gateway {
+        Gateway { topics: Topics::new(base_topic), prefix: home_assistant.prefix.clone() }
+    }
+
+    /// The part that says who speaks; Home Assistant refuses a message without it.
+    fn origin(&self) -> Value {
+        json!({"name": "busker", "sw_version": env!("CARGO_PKG_VERSION")})
+    }
+}
+
+/// The announcement of one device, with its components by key.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Announcement {
+    topic: String,
+    /// Everything but the components.
+    head: Map<String, Value>,
+    components: Components,
+}
+
+/// In the order of the device's points.
+type Components = Vec<(String, Map<String, Value>)>;
+
+impl Announcement {
+    pub(super) fn new(
+        gateway: &Gateway,
+        identity: &str,
+        device: Value,
+        availability: &[String],
+        components: Components,
+    ) -> Announcement {
+        let mut head = Map::new();
+        head.insert("device".into(), device);
+        head.insert("origin".into(), gateway.origin());
+        if !availability.is_empty() {
+            let topics: Vec<Value> = availability.iter().map(|topic| json!({"topic": topic})).collect();
+            head.insert("availability".into(), topics.into());
+            head.insert("availability_mode".into(), "all".into());
+        }
+        head.insert("qos".into(), 1.into());
+        Announcement { topic: topics::discovery(&gateway.prefix, identity), head, components }
+    }
+
+    pub fn topic(&self) -> &str {
+        &self.topic
+    }
+
+    /// The keys and platforms of the components.
+    pub fn components(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.components.iter().map(|(key, component)| {
+            (key.as_str(), component.get("platform").and_then(Value::as_str).unwrap_or_default())
+        })
+    }
+
+    /// Nothing to announce: such a device is better not mentioned at all, since Home Assistant takes
+    /// an empty message for its removal.
+    pub fn is_empty(&self) -> bool {
+        self.components.is_empty()
+    }
+
+    /// The retained message.
+    pub fn message(&self) -> Message {
+        self.message_with(&[])
+    }
+
+    /// With tombstones for `gone` components beside those that are there.
+    fn message_with(&self, gone: &[(&str, &str)]) -> Message {
+        let mut components: Map<String, Value> = self
+            .components
+            .iter()
+            .map(|(key, component)| (key.clone(), Value::Object(component.clone())))
+            .collect();
+        for (key, platform) in gone {
+            components.insert((*key).into(), json!({"platform": platform}));
+        }
+        let mut payload = self.head.clone();
+        payload.insert("components".into(), components.into());
+        Message::retained(self.topic.clone(), Value::Object(payload).to_string())
+    }
+}
+
+/// What must be said before `next` when `previous` was announced: a component that is merely left
+/// out stays in Home Assistant as an orphan. `None` if nothing is dropped.
+pub fn farewell(previous: &Announcement, next: &Announcement) -> Option<Message> {
+    let kept: BTreeMap<&str, &str> = next.components().collect();
+    let gone: Vec<(&str, &str)> = previous.components().filter(|(key, _)| !kept.contains_key(key)).collect();
+    if gone.is_empty() {
+        return None;
+    }
+    Some(next.message_with(&gone))
+}
+
+/// The announcement of one device on the bus called `bus`, with the entities that exist while its
+/// selectors say what is `known`.
+pub fn announcement(
+    gateway: &Gateway,
+    device: &DeviceSettings,
+    bus: &str,
+    known: &[Option<i128>],
+) -> Announcement {
+    let topics = &gateway.topics;
+    let identity = topics.identity(&device.name);
+    let mut components = Components::new();
+    for (index, point) in device.device.points.iter().enumerate() {
+        let entities =
+            entity(&device.device, index, known).into_iter().chain(companions(&device.device, index, known));
+        for entity in entities {
+            components.push((entity.key.clone(), component(topics, device, &point.name, &entity)));
+        }
+    }
+    let about = json!({
+        "identifiers": [identity],
+        "name": device.title,
+        "manufacturer": device.device.manufacturer,
+        "model": device.device.model,
+        "via_device": topics.bus_identity(bus),
+    });
+    let availability = [topics.bridge_state(), topics.availability(&device.name)];
+    Announcement::new(gateway, &identity, without_empty(about), &availability, components)
+}
+
+fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Entity) -> Map<String, Value> {
+    let mut component = entity.component();
+    component.insert("name".into(), name_beside(&entity.name, &device.title));
+    let platform = entity.platform;
+    component.insert("unique_id".into(), format!("{}_{}", topics.identity(&device.name), entity.key).into());
+    // The point's name without the case: dashboards keep their entity when an input is set to another
+    // sensor, while its history, kept by `unique_id`, starts anew with each unit.
+    let object = if platform == Platform::Button { &entity.key } else { point };
+    component
+        .insert("default_entity_id".into(), format!("{}.{}_{object}", platform.name(), device.name).into());
+    if platform != Platform::Button {
+        component.insert("state_topic".into(), topics.state(&device.name, point).into());
+    }
+    if !matches!(platform, Platform::Sensor | Platform::BinarySensor) {
+        component.insert("command_topic".into(), topics.set(&device.name, point).into());
+    }
+    component
+}
+
+/// The entity's name without the device's in front, which Home Assistant puts there itself; null for
+/// an entity that is called as its device.
+fn name_beside(name: &str, title: &str) -> Value {
+    let begins_so = name.get(..title.len()).is_some_and(|start| start.eq_ignore_ascii_case(title));
+    match name.get(title.len()..) {
+        Some("") if begins_so => Value::Null,
+        Some(rest) if begins_so && rest.starts_with(' ') => sentence(rest.trim()).into(),
+        _ => name.into(),
+    }
+}
+
+/// Without keys whose text is empty: Home Assistant refuses some of them.
+fn without_empty(mut value: Value) -> Value {
+    if let Value::Object(map) = &mut value {
+        map.retain(|_, value| value.as_str() != Some(""));
+    }
+    value
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::address::{Address, Span, Table};
+    use crate::engine::device::{Case, Encoding, Form, Kind, Poll, Unit, Write, WriteRule};
+    use crate::engine::homeassistant::{announce_bridge, announce_bus};
+    use crate::engine::test_device::{device_of, point};
+
+    fn gateway() -> Gateway {
+        Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into() }
+    }
+
+    /// A relay, and an input that is °C or V as its mode (0, 1, 2: none) says.
+    fn device() -> DeviceSettings {
+        let at = |table, first| Address { span: Span::single(table, first), bits: None };
+        let mut relay = point("relay", at(Table::Coil, 0), Poll::Fast);
+        relay.write = Some(Write { at: relay.at, with: None, rule: WriteRule::Any });
+        relay.presentation.name = Some("Heating relay".into());
+        let mode = point("mode", at(Table::Holding, 0), Poll::Slow);
+        let mut input = point("input", at(Table::Input, 0), Poll::Fast);
+        let form = |unit: &str| Some(Form { unit: Unit::Fixed(unit.into()), ..Form::new(Kind::I16) });
+        let case = |key, name: &str, form| Case { key, name: name.into(), form };
+        input.encoding = Encoding::Cases {
+            by: 1,
+            cases: vec![case(0, "pt100", form("°C")), case(1, "voltage", form("V")), case(2, "off", None)],
+        };
+        let device = device_of(vec![relay, mode, input]);
+        DeviceSettings { name: "heating".into(), title: "Heating".into(), bus: 0, unit: 1, device }
+    }
+
+    fn announced(mode: Option<i128>) -> Announcement {
+        announcement(&gateway(), &device(), "cellar", &[None, mode, None])
+    }
+
+    fn payload(message: &Message) -> Value {
+        serde_json::from_str(&message.payload).expect("an announcement is JSON")
+    }
+
+    #[test]
+    fn an_announcement_is_one_retained_message_with_everything_home_assistant_needs() {
+        let message = announced(Some(0)).message();
+        assert_eq!(message.topic, "homeassistant/device/busker_heating/config");
+        assert!(message.retain);
+        let expected = json!({
+            "device": {
+                "identifiers": ["busker_heating"],
+                "name": "Heating",
+                "manufacturer": "Test",
+                "model": "T1",
+                "via_device": "busker_bus_cellar",
+            },
+            "origin": {"name": "busker", "sw_version": env!("CARGO_PKG_VERSION")},
+            "availability": [{"topic": "busker/bridge/state"}, {"topic": "busker/heating/availability"}],
+            "availability_mode": "all",
+            "qos": 1,
+            "components": {
+                "relay": {
+                    "platform": "switch",
+                    "name": "Relay",
+                    "unique_id": "busker_heating_relay",
+                    "default_entity_id": "switch.heating_relay",
+                    "state_topic": "busker/heating/relay",
+                    "command_topic": "busker/heating/relay/set",
+                },
+                "mode": {
+                    "platform": "sensor",
+                    "name": "Mode",
+                    "suggested_display_precision": 0,
+                    "unique_id": "busker_heating_mode",
+                    "default_entity_id": "sensor.heating_mode",
+                    "state_topic": "busker/heating/mode",
+                },
+                "input_c": {
+                    "platform": "sensor",
+                    "name": "Input",
+                    "device_class": "temperature",
+                    "unit_of_measurement": "°C",
+                    "state_class": "measurement",
+                    "suggested_display_precision": 0,
+                    "unique_id": "busker_heating_input_c",
+                    "default_entity_id": "sensor.heating_input",
+                    "state_topic": "busker/heating/input",
+                },
+            },
+        });
+        assert_eq!(payload(&message), expected);
+    }
+
+    #[test]
+    fn what_a_new_case_drops_is_buried_before_the_new_is_announced() {
+        let keys = |announcement: &Announcement| {
+            announcement.components().map(|(key, _)| key.to_string()).collect::<Vec<_>>()
+        };
+        assert_eq!(keys(&announced(None)), ["relay", "mode"]);
+        assert_eq!(keys(&announced(Some(1))), ["relay", "mode", "input_v"]);
+        assert_eq!(farewell(&announced(None), &announced(Some(0))), None);
+        assert_eq!(farewell(&announced(Some(1)), &announced(Some(1))), None);
+
+        let message = farewell(&announced(Some(0)), &announced(Some(1))).expect("°C is dropped");
+        let components = &payload(&message)["components"];
+        assert_eq!(components["input_c"], json!({"platform": "sensor"}));
+        assert_eq!(components["input_v"]["unique_id"], "busker_heating_input_v");
+        assert_eq!(components["relay"]["platform"], "switch");
+
+        let message = farewell(&announced(Some(1)), &announced(Some(2))).expect("V is dropped");
+        assert_eq!(payload(&message)["components"]["input_v"], json!({"platform": "sensor"}));
+    }
+
+    #[test]
+    fn the_device_hangs_on_its_bus_and_the_bus_on_the_gateway() {
+        let bridge = payload(&announce_bridge(&gateway()).message());
+        let bus = payload(&announce_bus(&gateway(), "cellar").message());
+        let device = payload(&announced(None).message());
+        assert_eq!(device["device"]["via_device"], bus["device"]["identifiers"][0]);
+        assert_eq!(bus["device"]["via_device"], bridge["device"]["identifiers"][0]);
+        assert_eq!(bridge["availability"], Value::Null);
+        assert_eq!(bridge["components"]["connection"]["state_topic"], "busker/bridge/state");
+    }
+}
