@@ -1,1 +1,367 @@
+//! What waits for the broker: the last value of each retained topic, and a bounded queue of the
+//! messages that are told once. The client library forgets what it has not sent when the connection
+//! breaks; this does not.
 
+use std::collections::{BTreeMap, VecDeque};
+
+use crate::engine::time::{Duration, Time};
+use crate::engine::topics::{Message, ONLINE, Topics};
+
+/// Messages told once that may wait; more push out the oldest.
+const ONCE_MAX: usize = 256;
+
+/// Home Assistant subscribes to the states of a new entity only some time after it was announced,
+/// and takes no notice of what comes before (0.4 s were too short, 0.8 s long enough).
+const STATES_AFTER_DISCOVERY: Duration = Duration::from_millis(1500);
+
+/// The messages of one gateway on their way to its broker.
+#[derive(Clone, Debug)]
+pub struct Outbox {
+    topics: Topics,
+    /// Topics that begin so are discovery.
+    discovery_prefix: String,
+    retained: BTreeMap<String, Retained>,
+    queue: VecDeque<Queued>,
+    once_waiting: usize,
+    dropped: u64,
+    /// Counts the retained topics, to send them again in the order in which they first came.
+    next_number: u64,
+    states_due_at: Option<Time>,
+}
+
+#[derive(Clone, Debug)]
+struct Retained {
+    payload: String,
+    queued: bool,
+    number: u64,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Queued {
+    /// Whatever the topic's newest payload is when its turn comes.
+    Newest(String),
+    Once(Message),
+}
+
+impl Outbox {
+    /// `discovery_prefix` is Home Assistant's, `homeassistant`.
+    pub fn new(topics: Topics, discovery_prefix: &str) -> Outbox {
+        Outbox {
+            topics,
+            discovery_prefix: format!("{discovery_prefix}/device/"),
+            retained: BTreeMap::new(),
+            queue: VecDeque::new(),
+            once_waiting: 0,
+            dropped: 0,
+            next_number: 0,
+            states_due_at: None,
+        }
+    }
+
+    /// Takes a message. The newest value of a retained topic replaces one that still waits.
+    pub fn push(&mut self, message: Message) {
+        if message.retain {
+            self.push_retained(message);
+        } else {
+            self.push_once(message);
+        }
+    }
+
+    /// The next message to send, if one waits.
+    pub fn next_message(&mut self) -> Option<Message> {
+        loop {
+            match self.queue.pop_front()? {
+                Queued::Once(message) => {
+                    self.once_waiting -= 1;
+                    return Some(message);
+                }
+                Queued::Newest(topic) => {
+                    if let Some(entry) = self.retained.get_mut(&topic) {
+                        entry.queued = false;
+                        return Some(Message::retained(topic, entry.payload.clone()));
+                    }
+                }
+            }
+        }
+    }
+
+    /// A message from [`Outbox::next_message`] could not be handed over: it is next again.
+    pub fn put_back(&mut self, message: Message) {
+        if !message.retain {
+            self.once_waiting += 1;
+            self.queue.push_front(Queued::Once(message));
+        } else if let Some(entry) = self.retained.get_mut(&message.topic) {
+            // A newer value that came meanwhile stands in the queue already.
+            if !entry.queued {
+                entry.queued = true;
+                self.queue.push_front(Queued::Newest(message.topic));
+            }
+        }
+    }
+
+    /// The broker is there again, and may have forgotten everything: all retained topics are sent
+    /// anew, the gateway's own `online` after them, and then what was waiting to be told once.
+    pub fn connected(&mut self) {
+        self.push_retained(Message::retained(self.topics.bridge_state(), ONLINE));
+        let waiting = std::mem::take(&mut self.queue);
+        let mut once: Vec<Message> = waiting
+            .into_iter()
+            .filter_map(|queued| match queued {
+                Queued::Once(message) => Some(message),
+                Queued::Newest(_) => None,
+            })
+            .collect();
+        for topic in self.in_order(|_| true) {
+            // A farewell goes before the announcement that it prepares.
+            let (before, rest) = once.into_iter().partition(|message| message.topic == topic);
+            once = rest;
+            self.queue.extend(Vec::into_iter(before).map(Queued::Once));
+            self.queue.push_back(Queued::Newest(topic));
+        }
+        self.queue.extend(once.into_iter().map(Queued::Once));
+        self.retained.values_mut().for_each(|entry| entry.queued = true);
+        self.states_due_at = None;
+    }
+
+    /// Home Assistant has started: it is told of all devices now, and of all values when it has had
+    /// the time to listen ([`Outbox::wake_at`]).
+    pub fn home_assistant_started(&mut self, now: Time) {
+        self.queue_again(|rank| rank == Rank::Discovery);
+        self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
+    }
+
+    /// When [`Outbox::wake`] has something to do.
+    pub fn wake_at(&self) -> Option<Time> {
+        self.states_due_at
+    }
+
+    /// The time of [`Outbox::wake_at`] has come.
+    pub fn wake(&mut self, now: Time) {
+        if self.states_due_at.is_some_and(|due| due <= now) {
+            self.states_due_at = None;
+            self.queue_again(|rank| rank != Rank::Discovery);
+        }
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.queue.is_empty()
+    }
+
+    /// Messages told once that were pushed out since the start.
+    pub fn dropped(&self) -> u64 {
+        self.dropped
+    }
+
+    fn push_retained(&mut self, message: Message) {
+        let number = self.next_number;
+        let entry = self.retained.entry(message.topic.clone()).or_insert_with(|| {
+            self.next_number += 1;
+            Retained { payload: String::new(), queued: false, number }
+        });
+        entry.payload = message.payload;
+        if !entry.queued {
+            entry.queued = true;
+            self.queue.push_back(Queued::Newest(message.topic));
+        }
+    }
+
+    fn push_once(&mut self, message: Message) {
+        if self.once_waiting == ONCE_MAX {
+            let oldest = self.queue.iter().position(|queued| matches!(queued, Queued::Once(_)));
+            oldest.and_then(|at| self.queue.remove(at));
+            self.dropped += 1;
+        } else {
+            self.once_waiting += 1;
+        }
+        let same_topic = Queued::Newest(message.topic.clone());
+        let waiting = self.queue.iter().position(|queued| *queued == same_topic);
+        self.queue.push_back(Queued::Once(message));
+        // What is told once to a retained topic prepares the value that follows.
+        if let Some(value) = waiting.and_then(|at| self.queue.remove(at)) {
+            self.queue.push_back(value);
+        }
+    }
+
+    /// Puts every retained topic of these ranks into the queue that is not there yet.
+    fn queue_again(&mut self, wanted: impl Fn(Rank) -> bool) {
+        for topic in self.in_order(wanted) {
+            if let Some(entry) = self.retained.get_mut(&topic).filter(|entry| !entry.queued) {
+                entry.queued = true;
+                self.queue.push_back(Queued::Newest(topic));
+            }
+        }
+    }
+
+    /// The retained topics of these ranks, by rank, then as they first came.
+    fn in_order(&self, wanted: impl Fn(Rank) -> bool) -> Vec<String> {
+        let mut topics: Vec<(Rank, u64, &String)> = self
+            .retained
+            .iter()
+            .map(|(topic, entry)| (self.rank(topic), entry.number, topic))
+            .filter(|(rank, ..)| wanted(*rank))
+            .collect();
+        topics.sort_unstable();
+        topics.into_iter().map(|(.., topic)| topic.clone()).collect()
+    }
+
+    fn rank(&self, topic: &str) -> Rank {
+        if topic.starts_with(&self.discovery_prefix) {
+            return Rank::Discovery;
+        }
+        let below = topic.strip_prefix(self.topics.base()).unwrap_or(topic);
+        match below.trim_start_matches('/').split_once('/') {
+            Some(("bridge", "state")) => Rank::BridgeState,
+            Some(("bridge", _)) => Rank::Bridge,
+            Some((_, "availability")) => Rank::Availability,
+            Some((_, "info")) => Rank::Info,
+            _ => Rank::State,
+        }
+    }
+}
+
+/// What is told first after a reconnect.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Rank {
+    Bridge,
+    Discovery,
+    Availability,
+    Info,
+    State,
+    /// Last: the gateway is online when its values are there.
+    BridgeState,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outbox() -> Outbox {
+        Outbox::new(Topics::new("busker"), "homeassistant")
+    }
+
+    fn retained(outbox: &mut Outbox, topic: &str, payload: &str) {
+        outbox.push(Message::retained(topic, payload));
+    }
+
+    fn once(outbox: &mut Outbox, topic: &str, payload: &str) {
+        outbox.push(Message::once(topic, payload));
+    }
+
+    /// Takes all and compares: `topic payload`, with a `!` behind what is not retained.
+    #[track_caller]
+    fn check_sent(outbox: &mut Outbox, expected: &[&str]) {
+        let mut sent = Vec::new();
+        while let Some(message) = outbox.next_message() {
+            let mark = if message.retain { "" } else { "!" };
+            sent.push(format!("{} {}{mark}", message.topic, message.payload));
+        }
+        assert_eq!(sent, expected);
+    }
+
+    fn filled() -> Outbox {
+        let mut outbox = outbox();
+        retained(&mut outbox, "busker/boiler/flow", "21.5");
+        retained(&mut outbox, "busker/boiler/availability", "online");
+        retained(&mut outbox, "busker/boiler/info", "{}");
+        retained(&mut outbox, "homeassistant/device/busker_bridge/config", "{1}");
+        retained(&mut outbox, "homeassistant/device/busker_boiler/config", "{2}");
+        retained(&mut outbox, "busker/bridge/info", "{3}");
+        while outbox.next_message().is_some() {}
+        outbox
+    }
+
+    const EVERYTHING: [&str; 7] = [
+        "busker/bridge/info {3}",
+        "homeassistant/device/busker_bridge/config {1}",
+        "homeassistant/device/busker_boiler/config {2}",
+        "busker/boiler/availability online",
+        "busker/boiler/info {}",
+        "busker/boiler/flow 21.5",
+        "busker/bridge/state online",
+    ];
+
+    #[test]
+    fn the_newest_value_wins_and_keeps_its_place() {
+        let mut outbox = outbox();
+        retained(&mut outbox, "busker/a/x", "1");
+        retained(&mut outbox, "busker/a/y", "1");
+        retained(&mut outbox, "busker/a/x", "2");
+        check_sent(&mut outbox, &["busker/a/x 2", "busker/a/y 1"]);
+        retained(&mut outbox, "busker/a/y", "1");
+        check_sent(&mut outbox, &["busker/a/y 1"]);
+    }
+
+    #[test]
+    fn a_reconnect_sends_everything_again_and_online_after_it() {
+        let mut outbox = filled();
+        check_sent(&mut outbox, &[]);
+        for _ in 0..2 {
+            outbox.connected();
+            check_sent(&mut outbox, &EVERYTHING);
+        }
+        once(&mut outbox, "busker/boiler/flow/outcome", "done");
+        outbox.connected();
+        let expected: Vec<&str> =
+            EVERYTHING.into_iter().chain(["busker/boiler/flow/outcome done!"]).collect();
+        check_sent(&mut outbox, &expected);
+    }
+
+    #[test]
+    fn a_start_of_home_assistant_is_answered_with_discovery_and_later_with_values() {
+        let mut outbox = filled();
+        outbox.connected();
+        while outbox.next_message().is_some() {}
+        let now = Time::from_millis(10_000);
+        outbox.home_assistant_started(now);
+        check_sent(&mut outbox, &EVERYTHING[1..3]);
+        outbox.wake(now + Duration::from_millis(900));
+        check_sent(&mut outbox, &[]);
+        let due = outbox.wake_at().expect("values follow");
+        assert!(due - now >= Duration::from_secs(1));
+        outbox.wake(due);
+        let expected: Vec<&str> = EVERYTHING[..1].iter().chain(&EVERYTHING[3..]).copied().collect();
+        check_sent(&mut outbox, &expected);
+        assert_eq!(outbox.wake_at(), None);
+    }
+
+    #[test]
+    fn what_could_not_be_handed_over_is_next_again_unless_it_is_old() {
+        let mut outbox = outbox();
+        retained(&mut outbox, "busker/a/x", "1");
+        once(&mut outbox, "busker/a/x/outcome", "done");
+        let first = outbox.next_message().expect("two wait");
+        outbox.put_back(first.clone());
+        check_sent(&mut outbox, &["busker/a/x 1", "busker/a/x/outcome done!"]);
+        retained(&mut outbox, "busker/a/x", "2");
+        outbox.put_back(first);
+        check_sent(&mut outbox, &["busker/a/x 2"]);
+    }
+
+    #[test]
+    fn of_too_many_messages_told_once_the_oldest_are_dropped_and_counted() {
+        let mut outbox = outbox();
+        retained(&mut outbox, "busker/a/x", "1");
+        for number in 0..ONCE_MAX + 3 {
+            once(&mut outbox, "busker/a/x/outcome", &number.to_string());
+        }
+        assert_eq!(outbox.dropped(), 3);
+        assert_eq!(outbox.next_message(), Some(Message::retained("busker/a/x", "1")));
+        assert_eq!(outbox.next_message(), Some(Message::once("busker/a/x/outcome", "3")));
+        assert_eq!(std::iter::from_fn(|| outbox.next_message()).count(), ONCE_MAX - 1);
+    }
+
+    #[test]
+    fn a_farewell_goes_before_the_announcement_that_it_prepares() {
+        let config = "homeassistant/device/busker_boiler/config";
+        let mut outbox = filled();
+        retained(&mut outbox, config, "{old}");
+        once(&mut outbox, config, "{farewell}");
+        retained(&mut outbox, config, "{new}");
+        let expected = [format!("{config} {{farewell}}!"), format!("{config} {{new}}")];
+        check_sent(&mut outbox.clone(), &[&expected[0], &expected[1]]);
+        outbox.connected();
+        let sent: Vec<Message> = std::iter::from_fn(|| outbox.next_message()).collect();
+        let at = sent.iter().position(|message| !message.retain).expect("the farewell is sent");
+        assert_eq!((sent[at].topic.as_str(), sent[at + 1].topic.as_str()), (config, config));
+    }
+}

@@ -79,11 +79,11 @@ impl Announcement {
 
     /// The retained message.
     pub fn message(&self) -> Message {
-        self.message_with(&[])
+        Message::retained(self.topic.clone(), self.payload_with(&[]))
     }
 
     /// With tombstones for `gone` components beside those that are there.
-    fn message_with(&self, gone: &[(&str, &str)]) -> Message {
+    fn payload_with(&self, gone: &[(&str, &str)]) -> String {
         let mut components: Map<String, Value> = self
             .components
             .iter()
@@ -94,19 +94,20 @@ impl Announcement {
         }
         let mut payload = self.head.clone();
         payload.insert("components".into(), components.into());
-        Message::retained(self.topic.clone(), Value::Object(payload).to_string())
+        Value::Object(payload).to_string()
     }
 }
 
 /// What must be said before `next` when `previous` was announced: a component that is merely left
-/// out stays in Home Assistant as an orphan. `None` if nothing is dropped.
+/// out stays in Home Assistant as an orphan. `None` if nothing is dropped. Not retained, since the
+/// topic keeps what `next` says.
 pub fn farewell(previous: &Announcement, next: &Announcement) -> Option<Message> {
     let kept: BTreeMap<&str, &str> = next.components().collect();
     let gone: Vec<(&str, &str)> = previous.components().filter(|(key, _)| !kept.contains_key(key)).collect();
     if gone.is_empty() {
         return None;
     }
-    Some(next.message_with(&gone))
+    Some(Message::once(next.topic.clone(), next.payload_with(&gone)))
 }
 
 /// The announcement of one device on the bus called `bus`, with the entities that exist while its
