@@ -1,1 +1,104 @@
+//! Profile files to devices: the file's shape, repetitions, names, and the rules beyond the shape.
+//!
+//! The way: [`Library`] (bytes by identifier) → `engine::yaml` → [`file`] (what the author typed) →
+//! `expand` (repetitions) → `resolve` (names to indices) → `check` (rules) →
+//! [`Device`] (what is true).
 
+mod check;
+mod expand;
+pub mod file;
+mod library;
+mod resolve;
+mod shared;
+mod text;
+
+pub use library::Library;
+
+use serde_json::Value as Json;
+
+use crate::engine::device::Device;
+use crate::engine::profile::file::Profile;
+use crate::engine::profile::shared::Shared;
+use crate::engine::yaml::{At, Diagnostic, Faults, Map, Node, Source, parse, read, schema_of};
+
+impl Library {
+    /// The device `id`, or every fault of its file. An unknown `id` is the caller's to find out
+    /// ([`Library::contains`]), who knows the place where it was asked for.
+    pub fn load(&self, id: &str) -> Result<Device, Vec<Diagnostic>> {
+        let mut faults = Faults::default();
+        let profile = self
+            .source(id, &mut faults)
+            .and_then(|source| parse(&source, &mut faults))
+            .and_then(|node| read::<Profile>(&node, &mut faults));
+        if let Some(profile) = &profile {
+            if profile.device.value != id {
+                let found = &profile.device.value;
+                let message =
+                    format!("`{found}` is not where the file is; expected `{id}`, its path without `.yaml`");
+                faults.add(&profile.device.place, message);
+            }
+        }
+        let device = profile.map(|profile| device_of(&profile, self, &mut faults));
+        faults.into_result(device)
+    }
+
+    /// The device in a file that need not be in the library; its shared files must be.
+    pub fn check(&self, shown: &str, bytes: &[u8]) -> Result<Device, Vec<Diagnostic>> {
+        let mut faults = Faults::default();
+        let device = Source::from_bytes(shown, bytes, &mut faults)
+            .and_then(|source| parse(&source, &mut faults))
+            .and_then(|node| read::<Profile>(&node, &mut faults))
+            .map(|profile| device_of(&profile, self, &mut faults));
+        faults.into_result(device)
+    }
+}
+
+/// A device whose points stand in the gateway's configuration, in the profile's form. `wire` and
+/// `home_assistant` are the values of those keys beside `points`, if they are there.
+///
+/// `None` if nothing can be made of it; as everywhere, a device that comes with faults is not to be used.
+pub fn load_inline(
+    points: &Node,
+    wire: Option<&Node>,
+    home_assistant: Option<&Node>,
+    library: &Library,
+    faults: &mut Faults,
+) -> Option<Device> {
+    let wire = match wire {
+        Some(node) => Some(read(node, faults)?),
+        None => None,
+    };
+    let home_assistant = match home_assistant {
+        Some(node) => read(node, faults)?,
+        None => Map::default(),
+    };
+    let profile = Profile {
+        place: points.named_at().clone(),
+        device: At::nowhere("inline".into()),
+        manufacturer: String::new(),
+        model: String::new(),
+        source: String::new(),
+        identify: None,
+        wire,
+        points: read(points, faults)?,
+        left_out: Map::default(),
+        home_assistant,
+    };
+    Some(device_of(&profile, library, faults))
+}
+
+/// The JSON Schema of a profile file.
+pub fn schema() -> Json {
+    schema_of::<Profile>("busker device profile")
+}
+
+fn device_of(profile: &Profile, library: &Library, faults: &mut Faults) -> Device {
+    let shared = Shared::of(profile, library, faults);
+    let points = expand::expand(&profile.points, &shared, faults);
+    let device = resolve::device(profile, &points, &shared, faults);
+    check::check(profile, &points, &device, faults);
+    device
+}
+
+#[cfg(test)]
+mod tests;

@@ -62,7 +62,7 @@ mod schema;
 pub use diagnostic::{Diagnostic, Faults, Place, Source};
 pub use node::{Content, Entry, Node};
 pub use parse::parse;
-pub use read::{At, KeySchema, Keys, Map, Read, list_of_choices, nearest, read};
+pub use read::{At, KeySchema, Keys, Map, Read, Record, list_of_choices, nearest, read};
 pub use record::{choices, record};
 pub use scalar::Scalar;
 pub use schema::{Definitions, schema_of};

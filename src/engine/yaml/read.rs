@@ -75,6 +75,17 @@ impl<T: Read> Read for Vec<T> {
     }
 }
 
+/// A value that is read later, when more is known.
+impl Read for Node {
+    fn read(node: &Node, _: &mut Faults) -> Option<Node> {
+        Some(node.clone())
+    }
+
+    fn schema(_: &mut Definitions) -> Json {
+        json!({})
+    }
+}
+
 /// A value together with its place, for checks that come after the reading.
 #[derive(Clone, Debug)]
 pub struct At<T> {
@@ -175,7 +186,14 @@ impl<K: Read + PartialEq, V: Read> Read for Map<K, V> {
     }
 }
 
-/// The keys of a map that shall become a record: what `record!` is made of.
+/// What `record!` makes of a struct.
+pub trait Record: Sized {
+    fn keys() -> Vec<&'static str>;
+    fn of(keys: &Keys<'_>, faults: &mut Faults) -> Option<Self>;
+    fn schemas(definitions: &mut Definitions) -> Vec<KeySchema>;
+}
+
+/// The keys of a map that shall become a record.
 pub struct Keys<'n> {
     node: &'n Node,
 }
@@ -207,13 +225,18 @@ impl<'n> Keys<'n> {
         Some(Keys { node })
     }
 
+    /// The key that the map stands under, or its beginning.
+    pub fn place(&self) -> &Place {
+        self.node.named_at()
+    }
+
     /// The value of the key `name`, or `default`; a missing key without one is a fault.
     pub fn value<T: Read>(&self, name: &str, default: Option<T>, faults: &mut Faults) -> Option<T> {
         match (self.node.get(plain(name)), default) {
             (Some(node), _) => T::read(node, faults),
             (None, Some(default)) => Some(default),
             (None, None) => {
-                faults.add(self.node.named_at(), format!("the key `{}` is missing here", plain(name)));
+                faults.add(self.place(), format!("the key `{}` is missing here", plain(name)));
                 None
             }
         }
@@ -244,6 +267,7 @@ impl<'n> Keys<'n> {
 }
 
 /// One key of a record, for its schema.
+#[derive(Clone)]
 pub struct KeySchema {
     pub name: &'static str,
     pub description: &'static str,

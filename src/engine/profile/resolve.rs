@@ -1,0 +1,456 @@
+//! Expanded points to the device: names become indices, words of the file become forms.
+//!
+//! A fault here leaves something harmless in the device's place, so that the checks can go on and
+//! all faults are told at once; a device with faults is never handed out.
+
+use crate::engine::device::{
+    self, Case, Decimals, Device, Encoding, Kind, Names, Order, Point, PointIndex, Poll, Presentation,
+    Quirks, Unit, Write, WriteRule,
+};
+use crate::engine::profile::expand::Expanded;
+use crate::engine::profile::file::{self, Cases, Form, Profile, Values};
+use crate::engine::profile::shared::Shared;
+use crate::engine::profile::text::{Digits, PointPath, Quirk, Writable};
+use crate::engine::value::Decimal;
+use crate::engine::yaml::{At, Faults, list_of_choices};
+
+/// The device that `profile`, expanded to `points`, describes.
+pub fn device(profile: &Profile, points: &[Expanded<'_>], shared: &Shared, faults: &mut Faults) -> Device {
+    let mut resolution = Resolution { profile, points, shared, faults };
+    let mut resolved: Vec<Point> = (0..points.len()).map(|index| resolution.point(index)).collect();
+    resolution.presentations(&mut resolved);
+    let wire = resolution.wire();
+    let identify = resolution.identify();
+    Device {
+        profile: profile.device.value.clone(),
+        manufacturer: profile.manufacturer.clone(),
+        model: profile.model.clone(),
+        source: profile.source.clone(),
+        identify,
+        wire,
+        points: resolved,
+        left_out: profile
+            .left_out
+            .iter()
+            .map(|(span, reason)| device::LeftOut { span: span.value, reason: reason.clone() })
+            .collect(),
+    }
+}
+
+struct Resolution<'a, 'f> {
+    profile: &'f Profile,
+    points: &'a [Expanded<'f>],
+    shared: &'a Shared,
+    faults: &'a mut Faults,
+}
+
+impl Resolution<'_, '_> {
+    fn point(&mut self, index: PointIndex) -> Point {
+        let expanded = &self.points[index];
+        let file = expanded.file;
+        let encoding = match (&file.by, &file.is) {
+            (Some(by), Some(cases)) if !expanded.is_flag => self.cases(expanded, by, cases),
+            _ => Encoding::Plain(self.form(expanded, &file.form)),
+        };
+        let re_read = file.re_read.iter().flat_map(|path| self.lookup_all(path, expanded)).collect();
+        Point {
+            name: expanded.name.clone(),
+            at: expanded.at,
+            also: expanded.also,
+            encoding,
+            poll: file.poll.as_ref().map_or(Poll::Never, |poll| poll.value),
+            write: if expanded.is_flag { None } else { write_of(expanded) },
+            persistent: file.persistent.as_ref().is_some_and(|persistent| persistent.value),
+            read_clears: file.read_clears.as_ref().is_some_and(|read_clears| read_clears.value),
+            default: file.default.as_ref().map(|default| default.value),
+            re_read,
+            deadband: None,
+            presentation: Presentation::default(),
+        }
+    }
+
+    fn form(&mut self, expanded: &Expanded<'_>, form: &Form) -> device::Form {
+        let names = self.names(expanded, form);
+        let kind = kind_of(expanded, form, &names);
+        let mut resolved = device::Form::new(kind);
+        resolved.order = form.order.unwrap_or_else(|| self.order());
+        resolved.scale = form.scale.as_ref().map_or(Decimal::ONE, |scale| scale.value);
+        resolved.offset = form.offset.as_ref().map_or(Decimal::ZERO, |offset| offset.value);
+        resolved.decimals = match &form.decimals {
+            None => None,
+            Some(At { value: Digits::Fixed(decimals), .. }) => Some(Decimals::Fixed(*decimals)),
+            Some(At { value: Digits::By(path), place }) => {
+                let path = At { value: path.clone(), place: place.clone() };
+                self.lookup(&path, expanded).map(Decimals::By)
+            }
+        };
+        resolved.unit = match (&form.unit, &form.unit_by) {
+            (Some(unit), _) => Unit::Fixed(unit.value.clone()),
+            (None, Some(path)) => self.lookup(path, expanded).map_or(Unit::None, Unit::By),
+            (None, None) => Unit::None,
+        };
+        resolved.difference = expanded.file.difference;
+        resolved.names = match names {
+            _ if kind == Kind::Bool => Names::None,
+            names if names.is_empty() => Names::None,
+            names if is_number(expanded, form) => Names::Some(names),
+            names => Names::All(names),
+        };
+        let invalid = expanded.file.form.invalid.iter().chain(form.invalid.iter());
+        for (word, reason) in invalid {
+            let word = as_decoded(kind, word.value);
+            if !resolved.invalid.iter().any(|(known, _)| *known == word) {
+                resolved.invalid.push((word, reason.clone()));
+            }
+        }
+        resolved.range = form.range.as_ref().map(|range| (range.min, range.max));
+        resolved
+    }
+
+    /// The named register values of `form`.
+    fn names(&self, expanded: &Expanded<'_>, form: &Form) -> Vec<(i128, String)> {
+        match form.values.as_ref().map(|values| &values.value) {
+            _ if expanded.is_flag => Vec::new(),
+            None => Vec::new(),
+            Some(Values::Listed(values)) => {
+                values.iter().map(|(value, name)| (value.value, name.clone())).collect()
+            }
+            Some(Values::Shared(file)) => self
+                .shared
+                .get(file)
+                .map(|cases| {
+                    cases.iter().map(|(value, case)| (value.value, case.name.value.clone())).collect()
+                })
+                .unwrap_or_default(),
+        }
+    }
+
+    fn cases(&mut self, expanded: &Expanded<'_>, by: &At<PointPath>, cases: &At<Cases>) -> Encoding {
+        // A float can be anything, so that no check finds fault with what is only unknown.
+        let unknown = Encoding::Plain(device::Form::new(Kind::F32));
+        let Some(by_index) = self.lookup(by, expanded) else { return unknown };
+        let selector = &self.points[by_index];
+        let mut names = self.names(selector, &selector.file.form);
+        if names.is_empty() && kind_of(selector, &selector.file.form, &names) == Kind::Bool {
+            names = vec![(0, "OFF".into()), (1, "ON".into())];
+        }
+        if names.is_empty() {
+            if selector.file.form.values.is_none() {
+                self.faults.add(
+                    &by.place,
+                    format!(
+                        "`{}` has no named values that could decide; expected `values` there",
+                        by.value.0
+                    ),
+                );
+            }
+            return unknown;
+        }
+        let mut resolved = Vec::new();
+        let mut missing = Vec::new();
+        match &cases.value {
+            Cases::Listed(listed) => {
+                let known: Vec<&str> = names.iter().map(|(_, name)| name.as_str()).collect();
+                for (name, _) in listed.iter().filter(|(name, _)| !known.contains(&name.value.as_str())) {
+                    self.faults.add(
+                        &name.place,
+                        format!(
+                            "`{}` is no value of `{}`; {}",
+                            name.value,
+                            by.value.0,
+                            list_of_choices(&name.value, &known)
+                        ),
+                    );
+                }
+                for (key, name) in &names {
+                    match listed.get(name) {
+                        Some(form) => {
+                            let form = form.as_ref().map(|form| self.form(expanded, form));
+                            resolved.push(Case { key: *key, name: name.clone(), form });
+                        }
+                        None if listed.names(name) => {}
+                        None => missing.push(format!("`{name}`")),
+                    }
+                }
+            }
+            Cases::Shared(file) => {
+                let shared = self.shared;
+                let Some(listed) = shared.get(file) else { return unknown };
+                for (key, name) in &names {
+                    match listed.get(key).filter(|case| case.name.value == *name) {
+                        Some(case) => {
+                            let form = Some(self.form(expanded, &case.form));
+                            resolved.push(Case { key: *key, name: name.clone(), form });
+                        }
+                        None => missing.push(format!("`{name}`")),
+                    }
+                }
+            }
+        }
+        if !missing.is_empty() {
+            let (has, cases_word) = if missing.len() == 1 { ("has", "case") } else { ("have", "case") };
+            self.faults.add(&cases.place, format!(
+                "{} of `{}` {has} no {cases_word} here; expected one for each value, `null` where there is no reading",
+                listed(&missing), by.value.0
+            ));
+        }
+        Encoding::Cases { by: by_index, cases: resolved }
+    }
+
+    /// The one point that `path` names, as seen from `from`.
+    fn lookup(&mut self, path: &At<PointPath>, from: &Expanded<'_>) -> Option<PointIndex> {
+        let found = self.lookup_all(path, from);
+        if found.len() > 1 {
+            let first = &self.points[found[0]].name;
+            self.faults.add(&path.place, format!(
+                "`{}` are {} points (`{first}` and others); expected one that is there once, or one of the same repetition",
+                path.value.0, found.len()
+            ));
+            return None;
+        }
+        found.first().copied()
+    }
+
+    /// All points that `path` names: those of the same repetition, or else those at the top.
+    fn lookup_all(&mut self, path: &At<PointPath>, from: &Expanded<'_>) -> Vec<PointIndex> {
+        let with_path = |wanted: &str, repetition: Option<u16>| -> Vec<PointIndex> {
+            let fits = |point: &Expanded<'_>| {
+                point.path == wanted && (repetition.is_none() || point.repetition == repetition)
+            };
+            (0..self.points.len()).filter(|index| fits(&self.points[*index])).collect()
+        };
+        let beside = match &from.group {
+            Some(group) => with_path(&format!("{group}.{}", path.value.0), from.repetition),
+            None => Vec::new(),
+        };
+        let found = if beside.is_empty() { with_path(&path.value.0, None) } else { beside };
+        if found.is_empty() && !self.has_faults(&path.value.0) {
+            let prefix = from.group.as_ref().map(|group| format!("{group}."));
+            let mut known: Vec<&str> = Vec::new();
+            for point in self.points {
+                let local = prefix.as_ref().and_then(|prefix| point.path.strip_prefix(prefix.as_str()));
+                let name = local.unwrap_or(&point.path);
+                if !known.contains(&name) {
+                    known.push(name);
+                }
+            }
+            self.faults.add(
+                &path.place,
+                format!("no point is called `{}`; {}", path.value.0, list_of_choices(&path.value.0, &known)),
+            );
+        }
+        found
+    }
+
+    /// Whether `path` may name a point that could not be read.
+    fn has_faults(&self, path: &str) -> bool {
+        let last = path.rsplit('.').next().unwrap_or(path);
+        let unread = |points: &crate::engine::yaml::Map<_, file::Point>| {
+            points.unread.iter().any(|name: &At<crate::engine::profile::text::Name>| {
+                name.value.0 == last || path.starts_with(&name.value.0)
+            })
+        };
+        unread(&self.profile.points)
+            || self
+                .profile
+                .points
+                .iter()
+                .any(|(_, point)| point.points.as_ref().is_some_and(|points| unread(points)))
+    }
+
+    fn order(&self) -> Order {
+        self.profile.wire.as_ref().and_then(|wire| wire.order).unwrap_or_default()
+    }
+
+    fn wire(&mut self) -> device::Wire {
+        let mut resolved = device::Wire {
+            limits: device::Limits::default(),
+            readable: Vec::new(),
+            forbidden: Vec::new(),
+            intervals: device::Intervals::default(),
+            response_timeout: None,
+            quirks: Quirks::default(),
+            watchdog: None,
+        };
+        let Some(wire) = &self.profile.wire else { return resolved };
+        if let Some(limits) = &wire.limits {
+            let of =
+                |limit: &Option<At<u16>>, default: u16| limit.as_ref().map_or(default, |limit| limit.value);
+            let defaults = resolved.limits;
+            resolved.limits = device::Limits {
+                read_registers: of(&limits.read_registers, defaults.read_registers),
+                read_bits: of(&limits.read_bits, defaults.read_bits),
+                write_registers: of(&limits.write_registers, defaults.write_registers),
+                gap: limits.gap,
+                delay: limits.delay.unwrap_or(defaults.delay),
+            };
+        }
+        resolved.readable = wire.readable.iter().map(|span| span.value).collect();
+        resolved.forbidden = wire
+            .forbidden
+            .iter()
+            .map(|(span, reason)| device::Forbidden { span: span.value, reason: reason.clone() })
+            .collect();
+        if let Some(poll) = &wire.poll {
+            let defaults = resolved.intervals;
+            resolved.intervals.fast = poll.fast.as_ref().map_or(defaults.fast, |fast| fast.value);
+            resolved.intervals.slow = poll.slow.as_ref().map_or(defaults.slow, |slow| slow.value);
+        }
+        resolved.response_timeout = wire.response_timeout;
+        resolved.quirks = Quirks {
+            clamps_with_exception: wire.quirks.contains(&Quirk::ClampsWithException),
+            exception_function_varies: wire.quirks.contains(&Quirk::ExceptionFunctionVaries),
+        };
+        resolved.watchdog = wire.watchdog.as_ref().and_then(|path| self.lookup_at_top(path));
+        resolved
+    }
+
+    fn lookup_at_top(&mut self, path: &At<PointPath>) -> Option<PointIndex> {
+        let found: Vec<PointIndex> =
+            (0..self.points.len()).filter(|index| self.points[*index].path == path.value.0).collect();
+        if found.len() != 1 && !self.has_faults(&path.value.0) {
+            let mut known: Vec<&str> = self.points.iter().map(|point| point.path.as_str()).collect();
+            known.dedup();
+            let message = match found.len() {
+                0 => format!(
+                    "no point is called `{}`; {}",
+                    path.value.0,
+                    list_of_choices(&path.value.0, &known)
+                ),
+                count => format!("`{}` are {count} points; expected one that is there once", path.value.0),
+            };
+            self.faults.add(&path.place, message);
+        }
+        found.first().copied()
+    }
+
+    fn identify(&mut self) -> Option<device::Identify> {
+        let identify = self.profile.identify.as_ref()?;
+        match (&identify.vendor, &identify.product, &identify.at, identify.equals) {
+            (Some(vendor), Some(product), None, None) if identify.mask.is_none() => {
+                Some(device::Identify::Names { vendor: vendor.clone(), product: product.clone() })
+            }
+            (None, None, Some(at), Some(equals)) => {
+                let mask = identify.mask.unwrap_or(0xFFFF);
+                if at.table().is_bits() || at.count() != 1 {
+                    self.faults.add(&at.place, "this is no single register; expected one like `input 0`");
+                }
+                if equals & !mask != 0 {
+                    self.faults.add(&identify.place, format!(
+                        "`equals: 0x{equals:04X}` has bits that `mask: 0x{mask:04X}` takes away; expected only bits of the mask"
+                    ));
+                }
+                Some(device::Identify::Word { at: at.value, mask, equals })
+            }
+            _ => {
+                self.faults.add(
+                    &identify.place,
+                    "not one way to identify the device; expected `vendor` and `product`, or `at` and `equals` (and perhaps `mask`)",
+                );
+                None
+            }
+        }
+    }
+
+    fn presentations(&mut self, resolved: &mut [Point]) {
+        for (path, wish) in self.profile.home_assistant.iter() {
+            let found: Vec<PointIndex> =
+                (0..self.points.len()).filter(|index| self.points[*index].path == path.value.0).collect();
+            if found.is_empty() && !self.has_faults(&path.value.0) {
+                let mut known: Vec<&str> = self.points.iter().map(|point| point.path.as_str()).collect();
+                known.dedup();
+                self.faults.add(
+                    &path.place,
+                    format!(
+                        "no point has the path `{}`; {}",
+                        path.value.0,
+                        list_of_choices(&path.value.0, &known)
+                    ),
+                );
+            }
+            for index in found {
+                let text = |text: &Option<At<String>>| text.as_ref().map(|text| text.value.clone());
+                resolved[index].presentation = Presentation {
+                    platform: wish.r#as.as_ref().map(|platform| platform.value),
+                    name: wish.name.as_ref().map(|name| match self.points[index].repetition {
+                        Some(number) => format!("{name} {number}"),
+                        None => name.clone(),
+                    }),
+                    device_class: text(&wish.device_class),
+                    state_class: text(&wish.state_class),
+                    category: wish.category,
+                    icon: text(&wish.icon),
+                    enabled: wish.enabled,
+                };
+            }
+        }
+    }
+}
+
+fn write_of(expanded: &Expanded<'_>) -> Option<Write> {
+    let file = expanded.file;
+    let rule = match (&file.press, &file.write) {
+        (Some(word), _) => WriteRule::Press {
+            word: word.value,
+            self_clearing: file.self_clearing.as_ref().is_some_and(|clearing| clearing.value),
+        },
+        (None, Some(write)) => match &write.value {
+            Writable::Any => WriteRule::Any,
+            Writable::Range { range, step } => {
+                WriteRule::Range { min: range.min, max: range.max, step: *step }
+            }
+            Writable::Names(names) => WriteRule::Names(names.clone()),
+        },
+        (None, None) => return None,
+    };
+    let at = expanded.write_at.unwrap_or(expanded.at);
+    Some(Write { at, with: file.write_with.as_ref().map(|function| function.value), rule })
+}
+
+/// Whether `values` beside it are names of some numbers, and not an enumeration.
+fn is_number(expanded: &Expanded<'_>, form: &Form) -> bool {
+    let writes_a_range =
+        expanded.file.write.as_ref().is_some_and(|write| matches!(write.value, Writable::Range { .. }));
+    writes_a_range
+        || form.r#type.is_some()
+        || form.scale.is_some()
+        || form.offset.is_some()
+        || form.decimals.is_some()
+        || form.unit.is_some()
+        || form.unit_by.is_some()
+}
+
+/// The type, said or understood: single bits are flags, and so is what is only `OFF` or `ON`.
+fn kind_of(expanded: &Expanded<'_>, form: &Form, names: &[(i128, String)]) -> Kind {
+    if let Some(kind) = &form.r#type {
+        return kind.value;
+    }
+    let is_off_and_on = names.len() == 2
+        && names.iter().any(|(value, name)| (*value, name.as_str()) == (0, "OFF"))
+        && names.iter().any(|(value, name)| (*value, name.as_str()) == (1, "ON"));
+    let one_bit = match expanded.at.bits {
+        Some(bits) => bits.width() == 1,
+        None => expanded.at.span.table().is_bits() && expanded.at.span.count() == 1,
+    };
+    let is_number = is_number(expanded, form);
+    if (is_off_and_on || one_bit && names.is_empty()) && !is_number { Kind::Bool } else { Kind::U16 }
+}
+
+/// 0x8000 of a signed register is -32768.
+fn as_decoded(kind: Kind, word: i128) -> i128 {
+    match kind.integer_range() {
+        Some((min, max)) if min < 0 && word > max && word <= max - min => word + 2 * min,
+        _ => word,
+    }
+}
+
+/// `a`, `a and b`, `a, b and c`; of many only the first.
+fn listed(words: &[String]) -> String {
+    const SHOWN_MAX: usize = 5;
+    match words {
+        [] => String::new(),
+        [one] => one.clone(),
+        [first @ .., last] if words.len() <= SHOWN_MAX => format!("{} and {last}", first.join(", ")),
+        _ => format!("{} and {} more", words[..SHOWN_MAX].join(", "), words.len() - SHOWN_MAX),
+    }
+}
