@@ -1,1 +1,331 @@
+//! One command, from the wanted value to exactly one outcome.
+//!
+//! Read first where it matters (EEPROM is written only if it differs; a field of bits needs its
+//! neighbours), write, read back, compare. A write without an answer is never repeated: what the
+//! device holds is read, and decides. The state topic is none of this module's business: it shows
+//! only what reads found.
 
+use crate::engine::address::{Address, Span};
+use crate::engine::codec;
+use crate::engine::device::{Device, Names, Point, PointIndex, Write, WriteFunction, WriteRule};
+use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
+
+/// A command that has begun.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CommandFlow {
+    point: PointIndex,
+    wanted: String,
+    state: State,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum State {
+    /// Reads what is there, to compare or to keep the neighbouring bits.
+    ReadingBefore { field: Vec<u16> },
+    /// The write is on its way. `field` is what the point's own bits shall be.
+    Writing { field: Vec<u16> },
+    /// Reads what the device holds now. `doubt` says what was wrong with the write's own answer.
+    ReadingBack { field: Vec<u16>, doubt: Option<Doubt> },
+}
+
+/// Why the answer to a write does not settle the matter.
+#[derive(Clone, Debug, PartialEq)]
+enum Doubt {
+    NoAnswer(RequestError),
+    /// The device says that it clamps, and that it does so with an exception.
+    Clamped,
+}
+
+/// What to do next with a command.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Step {
+    Ask(Call),
+    Finished(Outcome),
+}
+
+/// How a command ended; the payload of the `outcome` topic.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outcome {
+    pub kind: OutcomeKind,
+    pub wanted: String,
+    /// What the device holds, as far as it is known.
+    pub found: Option<String>,
+    pub reason: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OutcomeKind {
+    /// Written, and read back as wanted.
+    Done,
+    /// EEPROM held it already; nothing was written.
+    Unchanged,
+    /// A rule of the profile or the device itself said no; nothing was changed.
+    Refused,
+    /// Written, but the device holds something else.
+    NotTaken,
+    /// The device did not answer, and what it holds is not known.
+    NoReply,
+    /// It waited too long, or a newer value took its place.
+    Expired,
+}
+
+impl OutcomeKind {
+    pub const fn name(self) -> &'static str {
+        match self {
+            OutcomeKind::Done => "done",
+            OutcomeKind::Unchanged => "unchanged",
+            OutcomeKind::Refused => "refused",
+            OutcomeKind::NotTaken => "not_taken",
+            OutcomeKind::NoReply => "no_reply",
+            OutcomeKind::Expired => "expired",
+        }
+    }
+}
+
+impl Outcome {
+    pub fn new(kind: OutcomeKind, wanted: &str, reason: impl Into<String>) -> Outcome {
+        Outcome { kind, wanted: wanted.to_string(), found: None, reason: Some(reason.into()) }
+    }
+
+    /// `{"outcome":"done","wanted":"ON","found":"ON","reason":null}`
+    pub fn to_json(&self) -> String {
+        serde_json::json!({
+            "outcome": self.kind.name(),
+            "wanted": self.wanted,
+            "found": self.found,
+            "reason": self.reason,
+        })
+        .to_string()
+    }
+}
+
+impl CommandFlow {
+    /// Checks the wish and takes the first step; `known` as in [`codec::resolve`]. The caller has made
+    /// sure that what decides the point's meaning is known.
+    pub fn begin(
+        device: &Device,
+        point: PointIndex,
+        wanted: &str,
+        known: &[Option<i128>],
+    ) -> (Option<CommandFlow>, Step) {
+        let details = &device.points[point];
+        let refuse =
+            |reason: String| (None, Step::Finished(Outcome::new(OutcomeKind::Refused, wanted, reason)));
+        let Some(write) = &details.write else {
+            return refuse(format!("`{}` is read-only", details.name));
+        };
+        let field = match codec::resolve(device, point, known) {
+            Ok(resolved) => match codec::encode(details, &write.rule, &resolved, wanted) {
+                Ok(field) => field,
+                Err(reason) => return refuse(reason),
+            },
+            Err(missing) => return refuse(missing.to_string()),
+        };
+        let flow = |state| CommandFlow { point, wanted: wanted.to_string(), state };
+        if is_press(write) || !(details.persistent || write.at.bits.is_some()) {
+            let call = write_call(write, &field);
+            return (Some(flow(State::Writing { field })), Step::Ask(call));
+        }
+        (Some(flow(State::ReadingBefore { field })), Step::Ask(Call::Read(write.at.span)))
+    }
+
+    pub fn point(&self) -> PointIndex {
+        self.point
+    }
+
+    pub fn wanted(&self) -> &str {
+        &self.wanted
+    }
+
+    /// The place that is being read, if the question under way is a read of the point's own place: its
+    /// words are news for every point in it.
+    pub fn reads(&self) -> bool {
+        matches!(self.state, State::ReadingBefore { .. } | State::ReadingBack { .. })
+    }
+
+    /// Takes the answer to the last question.
+    pub fn answered(
+        &mut self,
+        device: &Device,
+        known: &[Option<i128>],
+        result: &Result<Answer, RequestError>,
+    ) -> Step {
+        let details = &device.points[self.point];
+        let Some(write) = &details.write else {
+            return self.finish(OutcomeKind::Refused, None, Some("read-only".into()));
+        };
+        match self.state.clone() {
+            State::ReadingBefore { field } => self.read_before(device, details, write, known, field, result),
+            State::Writing { field } => self.written(device, details, write, field, result),
+            State::ReadingBack { field, doubt } => {
+                self.read_back(device, details, write, known, &field, doubt, result)
+            }
+        }
+    }
+
+    fn read_before(
+        &mut self,
+        device: &Device,
+        details: &Point,
+        write: &Write,
+        known: &[Option<i128>],
+        field: Vec<u16>,
+        result: &Result<Answer, RequestError>,
+    ) -> Step {
+        let words = match result {
+            Ok(answer) => words_of(answer),
+            Err(RequestError::Exception(code)) => return self.refused_by_device(*code),
+            Err(error) => {
+                let reason = format!("nothing was written: {error}");
+                return self.finish(OutcomeKind::NoReply, None, Some(reason));
+            }
+        };
+        let Some(held) = codec::words_at(write.at, write.at.span.first(), &words) else {
+            return self.finish(OutcomeKind::NoReply, None, Some("the read before was too short".into()));
+        };
+        if details.persistent && held == field {
+            let found = tell(device, self.point, known, &held);
+            return self.finish(OutcomeKind::Unchanged, found, None);
+        }
+        let Some(bits) = write.at.bits else {
+            self.state = State::Writing { field: field.clone() };
+            return Step::Ask(write_call(write, &field));
+        };
+        if let Some(meaning) = meaning_of_whole_register(device, write.at.span, words[0]) {
+            // One bit changed in 11111 would be a number out of range, which a device may clamp to
+            // "all relays on" (FuehlerSysteme, chapters 6.1.2 and 9).
+            let reason = format!("the register holds {meaning}, of which single bits cannot be changed");
+            return self.finish(OutcomeKind::Refused, None, Some(reason));
+        }
+        let call = write_call(write, &[bits.insert(words[0], field[0])]);
+        self.state = State::Writing { field };
+        Step::Ask(call)
+    }
+
+    fn written(
+        &mut self,
+        device: &Device,
+        details: &Point,
+        write: &Write,
+        field: Vec<u16>,
+        result: &Result<Answer, RequestError>,
+    ) -> Step {
+        let press = is_press(write);
+        let doubt = match result {
+            Ok(_) if press && !is_self_clearing(write) => return self.finish(OutcomeKind::Done, None, None),
+            Ok(_) => None,
+            Err(RequestError::Exception(3)) if device.wire.quirks.clamps_with_exception => {
+                Some(Doubt::Clamped)
+            }
+            Err(RequestError::Exception(code)) => return self.refused_by_device(*code),
+            Err(error) if press => return self.finish(OutcomeKind::NoReply, None, Some(error.to_string())),
+            Err(error) => Some(Doubt::NoAnswer(error.clone())),
+        };
+        self.state = State::ReadingBack { field, doubt };
+        Step::Ask(Call::Read(details.at.span))
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "one step's whole context, used nowhere else")]
+    fn read_back(
+        &mut self,
+        device: &Device,
+        details: &Point,
+        write: &Write,
+        known: &[Option<i128>],
+        field: &[u16],
+        doubt: Option<Doubt>,
+        result: &Result<Answer, RequestError>,
+    ) -> Step {
+        let words = match result {
+            Ok(answer) => words_of(answer),
+            Err(error) => {
+                let reason = match doubt {
+                    Some(Doubt::NoAnswer(of_write)) => of_write.to_string(),
+                    _ => format!("written, but not read back: {error}"),
+                };
+                return self.finish(OutcomeKind::NoReply, None, Some(reason));
+            }
+        };
+        let Some(held) = codec::words_at(details.at, details.at.span.first(), &words) else {
+            return self.finish(OutcomeKind::NoReply, None, Some("the read-back was too short".into()));
+        };
+        let found = tell(device, self.point, known, &held);
+        let cleared = is_self_clearing(write) && held.iter().all(|word| *word == 0);
+        if held == field || cleared {
+            return self.finish(OutcomeKind::Done, found, None);
+        }
+        let reason = match doubt {
+            Some(Doubt::NoAnswer(error)) => error.to_string(),
+            Some(Doubt::Clamped) => "the device limits the value".to_string(),
+            None => "the device holds another value".to_string(),
+        };
+        self.finish(OutcomeKind::NotTaken, found, Some(reason))
+    }
+
+    fn refused_by_device(&self, code: u8) -> Step {
+        self.finish(OutcomeKind::Refused, None, Some(format!("exception {code} ({})", exception_name(code))))
+    }
+
+    fn finish(&self, kind: OutcomeKind, found: Option<String>, reason: Option<String>) -> Step {
+        Step::Finished(Outcome { kind, wanted: self.wanted.clone(), found, reason })
+    }
+}
+
+/// A read's words, one for each address: a bit is 0 or 1.
+pub fn words_of(answer: &Answer) -> Vec<u16> {
+    match answer {
+        Answer::Words(words) => words.clone(),
+        Answer::Bits(bits) => bits.iter().map(|bit| u16::from(*bit)).collect(),
+        _ => Vec::new(),
+    }
+}
+
+fn is_press(write: &Write) -> bool {
+    matches!(write.rule, WriteRule::Press { .. })
+}
+
+fn is_self_clearing(write: &Write) -> bool {
+    matches!(write.rule, WriteRule::Press { self_clearing: true, .. })
+}
+
+fn tell(device: &Device, point: PointIndex, known: &[Option<i128>], held: &[u16]) -> Option<String> {
+    let resolved = codec::resolve(device, point, known).ok()?;
+    Some(codec::read(&resolved, held).to_string())
+}
+
+/// The request that puts `words` at the point's place.
+fn write_call(write: &Write, words: &[u16]) -> Call {
+    let Address { span, .. } = write.at;
+    let address = span.first();
+    if span.table().is_bits() {
+        let values: Vec<bool> = (0..span.count()).map(|bit| words[0] >> bit & 1 == 1).collect();
+        return match (write.with, &values[..]) {
+            (Some(WriteFunction::MultipleCoils), _) => Call::WriteCoils { address, values },
+            (_, [on]) => Call::WriteCoil { address, on: *on },
+            _ => Call::WriteCoils { address, values },
+        };
+    }
+    match (write.with, words) {
+        (Some(WriteFunction::MultipleRegisters), _) => {
+            Call::WriteRegisters { address, words: words.to_vec() }
+        }
+        (_, [word]) => Call::WriteRegister { address, word: *word },
+        _ => Call::WriteRegisters { address, words: words.to_vec() },
+    }
+}
+
+/// The name of what a register holds, where a point of the whole register names that very value.
+fn meaning_of_whole_register(device: &Device, register: Span, held: u16) -> Option<String> {
+    device
+        .points
+        .iter()
+        .filter(|point| point.at.span == register && point.at.bits.is_none())
+        .filter_map(Point::plain)
+        .find_map(|form| {
+            let named = if let Names::Some(names) = &form.names { &names[..] } else { &[] };
+            let mut meanings = named.iter().chain(&form.invalid);
+            meanings
+                .find(|(value, _)| *value == i128::from(held))
+                .map(|(value, name)| format!("{value} ({name})"))
+        })
+}

@@ -1,0 +1,612 @@
+//! One device on the bus: whether it is there, what is known of it, what to ask it next.
+
+use serde_json::json;
+
+use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::device::{Device, Identify, Point, PointIndex};
+use crate::engine::health::{Counters, DeviceReport, PointReport};
+use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
+use crate::engine::plan::{self, Cost, Read};
+use crate::engine::schedule::{Polls, Urgency};
+use crate::engine::settings::DeviceSettings;
+use crate::engine::state::Values;
+use crate::engine::time::{Duration, Time};
+use crate::engine::topics::{Message, OFFLINE, ONLINE};
+use crate::engine::value::{Missing, Reading};
+
+use super::{Context, Severity, unit_of};
+
+/// So many requests in a row without an answer, and a device counts as offline.
+const FAILURES_UNTIL_OFFLINE: u32 = 3;
+/// The longest pause between two attempts to reach a silent device: what its return may take.
+const PAUSE_LONGEST: Duration = Duration::from_secs(12);
+/// A device that is not the one that the profile describes is asked again after this.
+const PAUSE_MISMATCH: Duration = Duration::from_secs(30);
+/// A read that the device answers with an exception is asked again after this.
+const PAUSE_EXCEPTION: Duration = Duration::from_secs(60);
+/// After "busy" (exceptions 5 and 6) the device is asked again after this.
+const PAUSE_BUSY: Duration = Duration::from_millis(200);
+
+pub(super) struct DeviceState {
+    settings: DeviceSettings,
+    cost: Cost,
+    values: Values,
+    polls: Polls,
+    /// Gaps that the device has refused to be read over.
+    refused: Vec<crate::engine::address::Span>,
+    presence: Presence,
+    /// Requests without an answer since the last answer.
+    failures: u32,
+    /// Nothing is asked before.
+    paused_until: Time,
+    served_at: Time,
+    last_answer_end: Time,
+    last_answer_at: Option<Time>,
+    counters: Counters,
+    identity: Option<String>,
+    told_available: bool,
+    told_info: String,
+    announced: Option<Announcement>,
+    announcement_due: bool,
+    /// A `get` or a command wants these told even if they have not changed.
+    tell_anyway: Vec<PointIndex>,
+    warned_of_retained: Vec<PointIndex>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Presence {
+    /// Not heard of since the link came up, or fallen silent.
+    Absent { reason: String },
+    /// Something answers, but it is not the device that the profile describes.
+    Mismatch { reason: String },
+    /// Identified and being read.
+    Present,
+}
+
+/// What the schedule wants from this device.
+pub(super) enum Polled {
+    Identification(Call),
+    Read(usize, Call),
+}
+
+impl DeviceState {
+    pub(super) fn new(settings: DeviceSettings, cost: Cost) -> DeviceState {
+        let values = Values::new(&settings.device);
+        let reads = plan::plan(&settings.device, cost, &[]);
+        let polls = Polls::new(reads, settings.device.wire.intervals, |point| values.is_selector(point));
+        DeviceState {
+            cost,
+            values,
+            polls,
+            refused: Vec::new(),
+            presence: Presence::Absent { reason: "not yet asked".into() },
+            failures: 0,
+            paused_until: Time::default(),
+            served_at: Time::default(),
+            last_answer_end: Time::default(),
+            last_answer_at: None,
+            counters: Counters::default(),
+            identity: None,
+            told_available: false,
+            told_info: String::new(),
+            announced: None,
+            announcement_due: true,
+            tell_anyway: Vec::new(),
+            warned_of_retained: Vec::new(),
+            settings,
+        }
+    }
+
+    // What others ask about it.
+
+    pub(super) fn name(&self) -> &str {
+        &self.settings.name
+    }
+
+    pub(super) fn device(&self) -> &Device {
+        &self.settings.device
+    }
+
+    pub(super) fn details(&self, point: PointIndex) -> &Point {
+        &self.settings.device.points[point]
+    }
+
+    pub(super) fn known(&self) -> &[Option<i128>] {
+        self.values.known()
+    }
+
+    pub(super) fn served_at(&self) -> Time {
+        self.served_at
+    }
+
+    pub(super) fn point_named(&self, name: &str) -> Option<PointIndex> {
+        self.settings.device.points.iter().position(|point| point.name == name)
+    }
+
+    pub(super) fn has_watchdog(&self) -> bool {
+        self.settings.device.wire.watchdog.is_some()
+    }
+
+    /// Whether a command to this point can begin: the device is there, is the right one, and what
+    /// decides the point's meaning is known.
+    pub(super) fn can_take(&self, point: PointIndex) -> bool {
+        self.presence == Presence::Present
+            && self.failures == 0
+            && self.details(point).selectors().iter().all(|selector| self.known()[*selector].is_some())
+    }
+
+    /// Why a command to this point has not begun.
+    pub(super) fn why_not(&self, point: PointIndex) -> String {
+        match &self.presence {
+            Presence::Absent { reason } | Presence::Mismatch { reason } => reason.clone(),
+            Presence::Present => {
+                let unknown =
+                    self.details(point).selectors().into_iter().find(|at| self.known()[*at].is_none());
+                match unknown {
+                    Some(selector) => format!("waiting for {}", self.details(selector).name),
+                    None => "the device does not answer".to_string(),
+                }
+            }
+        }
+    }
+
+    /// Whether this is the first retained command seen for the point.
+    pub(super) fn warn_of_retained(&mut self, point: PointIndex) -> bool {
+        let first = !self.warned_of_retained.contains(&point);
+        if first {
+            self.warned_of_retained.push(point);
+        }
+        first
+    }
+
+    pub(super) fn report(&self) -> DeviceReport {
+        let points = self.settings.device.points.iter().enumerate().filter(|(_, point)| point.is_read());
+        DeviceReport {
+            name: self.settings.name.clone(),
+            title: self.settings.title.clone(),
+            profile: self.settings.device.profile.clone(),
+            unit: self.settings.unit,
+            online: self.told_available,
+            reason: self.reason(),
+            identity: self.identity.clone(),
+            counters: self.counters,
+            last_answer_at: self.last_answer_at,
+            points: points
+                .map(|(index, point)| PointReport {
+                    name: point.name.clone(),
+                    value: self.values.reading(index).to_string(),
+                    unit: unit_of(self, index),
+                    reason: match self.values.reading(index) {
+                        Reading::Missing(missing) => Some(missing.to_string()),
+                        _ => None,
+                    },
+                    read_at: self.values.read_at(index),
+                })
+                .collect(),
+        }
+    }
+
+    fn reason(&self) -> Option<String> {
+        match &self.presence {
+            Presence::Absent { reason } | Presence::Mismatch { reason } => Some(reason.clone()),
+            Presence::Present => None,
+        }
+    }
+
+    // What to ask it.
+
+    /// When it wants to be asked again.
+    pub(super) fn due_at(&self) -> Option<Time> {
+        match self.presence {
+            Presence::Present => self.polls.due_at().map(|due| due.max(self.paused_until)),
+            _ => Some(self.paused_until),
+        }
+    }
+
+    pub(super) fn most_urgent(&self, now: Time) -> Option<(Polled, Urgency)> {
+        if now < self.paused_until {
+            return None;
+        }
+        if self.presence != Presence::Present {
+            if let Some(call) = self.identification_call() {
+                return Some((Polled::Identification(call), Urgency::Wanted));
+            }
+        }
+        let (index, urgency) = self.polls.most_urgent(now)?;
+        Some((Polled::Read(index, Call::Read(self.polls.read(index).span)), urgency))
+    }
+
+    fn identification_call(&self) -> Option<Call> {
+        self.settings.device.identify.as_ref().map(|identify| match identify {
+            Identify::Names { .. } => Call::ReadIdentification { code: 1, object: 0 },
+            Identify::Word { at, .. } => Call::Read(*at),
+        })
+    }
+
+    pub(super) fn begin_read(&mut self, read: usize, now: Time) {
+        self.polls.begin(read, now);
+    }
+
+    /// The device is being asked: returns the time before which nothing may be sent.
+    pub(super) fn asked(&mut self, now: Time) -> Time {
+        self.served_at = now;
+        now.max(self.last_answer_end + self.settings.device.wire.limits.delay)
+    }
+
+    pub(super) fn timeout(&self, of_bus: Duration) -> Duration {
+        self.settings.device.wire.response_timeout.unwrap_or(of_bus).max(of_bus)
+    }
+
+    pub(super) fn request(&self, call: Call) -> Request {
+        Request { unit: self.settings.unit, call }
+    }
+
+    /// The point is wanted now, and told even if it has not changed.
+    pub(super) fn want(&mut self, point: PointIndex) {
+        self.polls.want(point);
+        if !self.tell_anyway.contains(&point) {
+            self.tell_anyway.push(point);
+        }
+    }
+
+    // What happened to it.
+
+    /// Before anything is known: what an earlier run left at the broker is taken back.
+    pub(super) fn introduce(&mut self, now: Time, context: &mut Context) {
+        self.publish_availability(false, context);
+        self.announce(context);
+        self.tell_all(now, context);
+        self.tell_info(context);
+    }
+
+    /// The link is up: ask at once.
+    pub(super) fn reconnect(&mut self, now: Time) {
+        self.failures = 0;
+        self.paused_until = now;
+        self.polls.want_all();
+    }
+
+    pub(super) fn count(&mut self, now: Time, reply: &Reply) {
+        self.counters.count_result(&reply.result);
+        self.counters.count_discarded(reply.discarded);
+        self.last_answer_end = reply.last_byte_at.unwrap_or(now);
+        if matches!(reply.result, Ok(_) | Err(RequestError::Exception(_))) {
+            self.last_answer_at = Some(now);
+            self.failures = 0;
+        }
+    }
+
+    pub(super) fn identified(
+        &mut self,
+        now: Time,
+        result: Result<Answer, RequestError>,
+        context: &mut Context,
+    ) {
+        match (result, &self.settings.device.identify) {
+            (Ok(answer), Some(identify)) => match check_identity(identify, &answer) {
+                Ok(identity) => {
+                    self.identity = Some(identity);
+                    self.arrive(now, context);
+                }
+                Err(found) => self.mistake(now, found, context),
+            },
+            (Err(RequestError::Exception(code)), _) => {
+                let reason = format!("it answers its identification with exception {code}: another device?");
+                self.mistake(now, reason, context);
+            }
+            (Err(error), _) => self.failed(now, &error, context),
+            (Ok(_), None) => {}
+        }
+    }
+
+    fn arrive(&mut self, now: Time, context: &mut Context) {
+        if let Presence::Absent { reason } | Presence::Mismatch { reason } = &self.presence {
+            if self.last_answer_at.is_some() && reason != "not yet asked" {
+                let text = format!("device {} is back", self.settings.name);
+                context.say(Severity::Info, text);
+            }
+        }
+        self.presence = Presence::Present;
+        self.paused_until = now;
+        self.polls.want_all();
+        self.tell_info(context);
+    }
+
+    fn mistake(&mut self, now: Time, reason: String, context: &mut Context) {
+        self.paused_until = now + PAUSE_MISMATCH;
+        let presence = Presence::Mismatch { reason: reason.clone() };
+        if self.presence != presence {
+            context.say(Severity::Warning, format!("device {}: {reason}", self.settings.name));
+            self.presence = presence;
+            self.disappear(now, context);
+        }
+    }
+
+    /// The device (or the way to it) is gone.
+    pub(super) fn lose(&mut self, now: Time, reason: &str, context: &mut Context) {
+        let presence = Presence::Absent { reason: reason.to_string() };
+        if self.presence != presence {
+            self.presence = presence;
+            self.disappear(now, context);
+        }
+    }
+
+    fn disappear(&mut self, now: Time, context: &mut Context) {
+        self.publish_availability(false, context);
+        self.values.lose_all(Missing::Offline);
+        self.tell_all(now, context);
+        self.tell_info(context);
+    }
+
+    fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
+        self.failures += 1;
+        // 0.25 s, 0.5 s, 1 s, … : the others have the bus meanwhile.
+        let pause = Duration::from_millis(125 << self.failures.min(8)).min(PAUSE_LONGEST);
+        self.paused_until = now + pause;
+        if self.failures == FAILURES_UNTIL_OFFLINE {
+            let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row");
+            context.say(Severity::Warning, format!("device {} is offline: {reason}", self.settings.name));
+            self.lose(now, &reason, context);
+        }
+    }
+
+    pub(super) fn polled(
+        &mut self,
+        now: Time,
+        index: usize,
+        result: Result<Answer, RequestError>,
+        context: &mut Context,
+    ) {
+        match result {
+            Ok(answer) => {
+                if self.presence != Presence::Present {
+                    // A device without an identification is there when it answers a read.
+                    self.arrive(now, context);
+                }
+                self.polls.end(index);
+                let read = self.polls.read(index).clone();
+                self.absorb(now, &read, &crate::engine::command::words_of(&answer), context);
+            }
+            Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
+            Err(error) => {
+                self.polls.end(index);
+                let read = self.polls.read(index).clone();
+                read.points.iter().for_each(|(point, _)| self.polls.want(*point));
+                self.failed(now, &error, context);
+            }
+        }
+        self.after_news(context);
+    }
+
+    /// The device answered a read with an exception: it is there, but will not tell this.
+    fn refused(&mut self, now: Time, index: usize, code: u8, context: &mut Context) {
+        let read = self.polls.read(index).clone();
+        let gaps = read.gaps();
+        if matches!(code, 5 | 6) {
+            self.polls.pause(index, now + PAUSE_BUSY);
+            return;
+        }
+        if code == 2 && !gaps.is_empty() {
+            self.refused.extend(gaps);
+            let reads = plan::plan(&self.settings.device, self.cost, &self.refused);
+            let values = &self.values;
+            self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
+            let text = format!(
+                "device {}: {} cannot be read in one request, and will be read in parts",
+                self.settings.name, read.span
+            );
+            context.say(Severity::Info, text);
+            return;
+        }
+        self.polls.end(index);
+        self.polls.pause(index, now + PAUSE_EXCEPTION);
+        for (point, _) in &read.points {
+            self.values.lose(*point, Missing::Exception(code));
+            self.tell(now, *point, context);
+        }
+    }
+
+    fn absorb(&mut self, now: Time, read: &Read, words: &[u16], context: &mut Context) {
+        let absorbed = self.values.absorb(now, &self.settings.device, read, words);
+        for point in &absorbed.dropped {
+            self.polls.want(*point);
+            self.tell(now, *point, context);
+            self.announcement_due = true;
+        }
+        for (point, raw) in absorbed.unnamed {
+            let name = &self.settings.device.points[point].name;
+            let text =
+                format!("device {}: {name} holds {raw}, which the profile does not name", self.settings.name);
+            context.say(Severity::Warning, text);
+        }
+        for (point, _) in &read.points {
+            self.tell(now, *point, context);
+        }
+    }
+
+    /// After a poll: what became complete with it is told.
+    fn after_news(&mut self, context: &mut Context) {
+        if self.presence != Presence::Present {
+            return;
+        }
+        if self.polls.first_round_is_over() {
+            if self.announcement_due {
+                self.announce(context);
+            }
+            if !self.told_available {
+                self.publish_availability(true, context);
+            }
+        }
+        self.tell_info(context);
+    }
+
+    // Commands.
+
+    /// A write to `point` goes out: what it decides is unknown until it has been read back.
+    pub(super) fn about_to_write(&mut self, now: Time, point: PointIndex, context: &mut Context) {
+        self.counters.writes += 1;
+        self.counters.persistent_writes += u64::from(self.details(point).persistent);
+        if self.values.is_selector(point) {
+            self.values.forget_selector(&self.settings.device, point);
+            self.tell_all(now, context);
+        }
+    }
+
+    /// Words that a command has read at the point's own place.
+    pub(super) fn read_for_command(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        words: &[u16],
+        context: &mut Context,
+    ) {
+        let details = self.details(point);
+        if !details.is_read() {
+            return;
+        }
+        let (poll, span) = (details.poll, details.at.span);
+        let inside = self.settings.device.points.iter().enumerate();
+        let points = inside
+            .filter(|(_, other)| other.is_read() && span.contains(other.at.span))
+            .map(|(index, other)| (index, other.at))
+            .collect();
+        self.absorb(now, &Read { poll, span, points, alone: false }, words, context);
+    }
+
+    /// The command has ended: what it may have changed is read again, and told as it is.
+    pub(super) fn command_ended(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        outcome: &Outcome,
+        context: &mut Context,
+    ) {
+        for partner in self.details(point).re_read.clone() {
+            self.polls.want(partner);
+        }
+        if self.details(point).is_read() {
+            if matches!(outcome.kind, OutcomeKind::NoReply) {
+                self.want(point);
+            } else {
+                // Told even if unchanged, so that a switch flips back that was moved in vain.
+                self.tell_anyway.push(point);
+                self.tell(now, point, context);
+            }
+        }
+        self.after_news(context);
+    }
+
+    // Telling.
+
+    fn tell_all(&mut self, now: Time, context: &mut Context) {
+        for point in 0..self.settings.device.points.len() {
+            self.tell(now, point, context);
+        }
+    }
+
+    fn tell(&mut self, now: Time, point: PointIndex, context: &mut Context) {
+        let details = &self.settings.device.points[point];
+        if !details.is_read() {
+            return;
+        }
+        let anyway = self.tell_anyway.contains(&point);
+        self.tell_anyway.retain(|other| *other != point);
+        if let Some(text) = self.values.tell(now, point, details, context.republish, anyway) {
+            let topic = context.gateway.topics.state(&self.settings.name, &details.name);
+            context.publish(Message::retained(topic, text));
+        }
+    }
+
+    fn publish_availability(&mut self, available: bool, context: &mut Context) {
+        self.told_available = available;
+        let topic = context.gateway.topics.availability(&self.settings.name);
+        context.publish(Message::retained(topic, if available { ONLINE } else { OFFLINE }));
+    }
+
+    /// The last word before the end.
+    pub(super) fn say_offline(&mut self, context: &mut Context) {
+        self.publish_availability(false, context);
+    }
+
+    fn announce(&mut self, context: &mut Context) {
+        self.announcement_due = false;
+        if !context.discovery {
+            return;
+        }
+        let next = homeassistant::announcement(
+            &context.gateway,
+            &self.settings,
+            &context.bus_name,
+            self.values.known(),
+        );
+        if next.is_empty() && self.announced.is_none() {
+            return;
+        }
+        if let Some(previous) = self.announced.take() {
+            if let Some(farewell) = homeassistant::farewell(&previous, &next) {
+                context.publish(farewell);
+            }
+        }
+        context.publish(next.message());
+        self.announced = Some(next);
+    }
+
+    fn tell_info(&mut self, context: &mut Context) {
+        let missing: serde_json::Map<String, serde_json::Value> = self
+            .settings
+            .device
+            .points
+            .iter()
+            .enumerate()
+            .filter(|(_, point)| point.is_read())
+            .filter_map(|(index, point)| match self.values.reading(index) {
+                Reading::Missing(missing) if self.presence == Presence::Present => {
+                    Some((point.name.clone(), missing.to_string().into()))
+                }
+                _ => None,
+            })
+            .collect();
+        let info = json!({
+            "profile": self.settings.device.profile,
+            "manufacturer": self.settings.device.manufacturer,
+            "model": self.settings.device.model,
+            "identity": self.identity,
+            "bus": context.bus_name,
+            "unit": self.settings.unit,
+            "online": self.presence == Presence::Present,
+            "reason": self.reason(),
+            "missing": missing,
+        })
+        .to_string();
+        if info != self.told_info {
+            let topic = context.gateway.topics.info(&self.settings.name);
+            context.publish(Message::retained(topic, info.clone()));
+            self.told_info = info;
+        }
+    }
+}
+
+/// What the device said of itself if it is the right one, else what is wrong with that.
+fn check_identity(identify: &Identify, answer: &Answer) -> Result<String, String> {
+    match (identify, answer) {
+        (Identify::Names { vendor, product }, Answer::Identification(found)) => {
+            let object = |number: u8| {
+                let object = found.objects.iter().find(|(id, _)| *id == number);
+                object.map_or("", |(_, text)| text.as_str())
+            };
+            let told = format!("{} {} {}", object(0), object(1), object(2)).trim().to_string();
+            if object(0) == vendor && object(1) == product {
+                Ok(told)
+            } else {
+                Err(format!("it says that it is `{told}`, not `{vendor} {product}`"))
+            }
+        }
+        (Identify::Word { at, mask, equals }, Answer::Words(words)) => match words.first() {
+            Some(word) if word & mask == *equals => Ok(format!("{word:#06x}")),
+            Some(word) => Err(format!("{at} holds {word:#06x}, not {equals:#06x}")),
+            None => Err(format!("{at} is empty")),
+        },
+        _ => Err("its identification is of another kind".to_string()),
+    }
+}

@@ -1,0 +1,495 @@
+//! One bus as a state machine: what happened goes in, what to do comes out.
+//!
+//! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
+//! `ask_next` chooses the next: the command that has begun, then waiting commands, then whichever
+//! device's read (or identification) is most urgent.
+
+mod device;
+mod waiting;
+
+use std::collections::VecDeque;
+
+use crate::engine::codec;
+use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
+use crate::engine::device::PointIndex;
+use crate::engine::health::{BusReport, Counters};
+use crate::engine::homeassistant::Gateway;
+use crate::engine::modbus::{Call, Reply, Request, RequestError};
+use crate::engine::plan::Cost;
+use crate::engine::settings::{Link, OnBrokerLoss, Settings};
+use crate::engine::time::{Duration, Time};
+use crate::engine::topics::Message;
+
+use device::{DeviceState, Polled};
+use waiting::{Waiting, WaitingCommands};
+
+/// What can happen to a bus.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Event {
+    /// The port is open, the connection stands.
+    LinkUp,
+    LinkDown(String),
+    /// The request of the last [`Action::Send`] has ended.
+    Reply(Reply),
+    Command(Command),
+    /// Read this point now, and tell it even if it has not changed.
+    Get {
+        device: String,
+        point: String,
+    },
+    BrokerUp,
+    BrokerDown,
+    /// The time of [`Bus::wake_at`] has come.
+    Wake,
+    /// Finish the request in flight, refuse what waits, say `offline`.
+    Shutdown,
+}
+
+/// A message on a `set` topic, as it came.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Command {
+    pub device: String,
+    pub point: String,
+    pub payload: String,
+    /// A replayed one; it is never obeyed.
+    pub retained: bool,
+}
+
+/// What is to be done.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Action {
+    /// Ask the line. Exactly one request is in flight: the next `Send` comes after its reply.
+    Send {
+        request: Request,
+        not_before: Time,
+        timeout: Duration,
+    },
+    Publish(Message),
+    /// Close the link, if it is open, and open it after this long. The first action of all.
+    Reopen {
+        after: Duration,
+    },
+    /// A line for the log: said once when something breaks and once when it heals.
+    Say(Severity, String),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Severity {
+    Info,
+    Warning,
+}
+
+/// One serial line or TCP connection, and the devices on it.
+pub struct Bus {
+    name: String,
+    link: Link,
+    response_timeout: Duration,
+    on_broker_loss: OnBrokerLoss,
+    context: Context,
+    devices: Vec<DeviceState>,
+    waiting: WaitingCommands,
+    /// The command that has begun, and its device.
+    active: Option<(usize, CommandFlow)>,
+    in_flight: Option<InFlight>,
+    link_state: LinkState,
+    broker_up: bool,
+    counters: Counters,
+    load: Load,
+    stopping: bool,
+    now: Time,
+}
+
+/// What everything on a bus shares: where messages go, and the actions that wait to be taken.
+struct Context {
+    actions: VecDeque<Action>,
+    gateway: Gateway,
+    discovery: bool,
+    bus_name: String,
+    republish: Duration,
+}
+
+impl Context {
+    fn publish(&mut self, message: Message) {
+        self.actions.push_back(Action::Publish(message));
+    }
+
+    fn say(&mut self, severity: Severity, text: String) {
+        self.actions.push_back(Action::Say(severity, text));
+    }
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum LinkState {
+    Up,
+    Down { reason: Option<String>, attempts: u32 },
+}
+
+/// What the request on the wire is for.
+struct InFlight {
+    device: usize,
+    purpose: Purpose,
+    sent_at: Time,
+}
+
+enum Purpose {
+    Identify,
+    Poll { read: usize },
+    Command,
+}
+
+impl Bus {
+    /// The bus number `index` of `settings`, with the devices that are on it.
+    pub fn new(now: Time, settings: &Settings, index: usize) -> Bus {
+        let bus = &settings.buses[index];
+        let mut context = Context {
+            actions: VecDeque::from([Action::Reopen { after: Duration::ZERO }]),
+            gateway: Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant),
+            discovery: settings.home_assistant.discovery,
+            bus_name: bus.name.clone(),
+            republish: settings.republish,
+        };
+        // Until a device's own latency is measured.
+        let cost = Cost::of(&bus.link, Duration::from_millis(5));
+        let of_bus = settings.devices.iter().filter(|device| device.bus == index);
+        let mut devices: Vec<DeviceState> =
+            of_bus.map(|device| DeviceState::new(device.clone(), cost)).collect();
+        for device in &mut devices {
+            device.introduce(now, &mut context);
+        }
+        Bus {
+            name: bus.name.clone(),
+            link: bus.link.clone(),
+            response_timeout: bus.response_timeout,
+            on_broker_loss: settings.on_broker_loss,
+            context,
+            devices,
+            waiting: WaitingCommands::default(),
+            active: None,
+            in_flight: None,
+            link_state: LinkState::Down { reason: None, attempts: 0 },
+            broker_up: true,
+            counters: Counters::default(),
+            load: Load::default(),
+            stopping: false,
+            now,
+        }
+    }
+
+    /// Tells the bus what happened. Never fails: what goes wrong becomes a reading or a report.
+    pub fn handle(&mut self, now: Time, event: Event) {
+        self.now = now;
+        match event {
+            Event::LinkUp => self.link_up(),
+            Event::LinkDown(reason) => self.link_down(reason),
+            Event::Reply(reply) => self.reply(reply),
+            Event::Command(command) => self.command(command),
+            Event::Get { device, point } => self.get(&device, &point),
+            Event::BrokerUp => self.broker_up = true,
+            Event::BrokerDown => self.broker_up = false,
+            Event::Wake => {}
+            Event::Shutdown => self.stopping = true,
+        }
+        self.expire_commands();
+        if self.stopping {
+            self.refuse_what_waits();
+        } else {
+            self.ask_next();
+        }
+    }
+
+    /// Takes the next thing to do, until there is none.
+    pub fn next_action(&mut self) -> Option<Action> {
+        self.context.actions.pop_front()
+    }
+
+    /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
+    /// flight its reply is what happens next.
+    pub fn wake_at(&self) -> Option<Time> {
+        if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
+            return self.waiting.next_deadline();
+        }
+        let of_devices =
+            self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
+        of_devices.chain(self.waiting.next_deadline()).min()
+    }
+
+    /// Whether a shutdown has been asked for and nothing is in flight any more.
+    pub fn is_finished(&self) -> bool {
+        self.stopping && self.in_flight.is_none()
+    }
+
+    /// The bus as it is now, for `/health`, `/metrics`, `/api` and `bridge/health`.
+    pub fn report(&self, now: Time) -> BusReport {
+        let reason = match &self.link_state {
+            LinkState::Up => None,
+            LinkState::Down { reason, .. } => Some(reason.clone().unwrap_or("not yet open".into())),
+        };
+        BusReport {
+            name: self.name.clone(),
+            link: match &self.link {
+                Link::Serial { path, .. } => format!("serial {path}"),
+                Link::Tcp { host, port } => format!("tcp {host}:{port}"),
+                Link::RtuOverTcp { host, port, .. } => format!("rtu over tcp {host}:{port}"),
+            },
+            up: self.link_state == LinkState::Up,
+            reason,
+            counters: self.counters,
+            load: self.load.share(now),
+            devices: self.devices.iter().map(DeviceState::report).collect(),
+        }
+    }
+
+    // What happened to the link.
+
+    fn link_up(&mut self) {
+        if let LinkState::Down { attempts, .. } = self.link_state {
+            if attempts > 0 {
+                self.context.say(Severity::Info, format!("bus {}: the link is back", self.name));
+            }
+        }
+        self.link_state = LinkState::Up;
+        for device in &mut self.devices {
+            device.reconnect(self.now);
+        }
+    }
+
+    fn link_down(&mut self, reason: String) {
+        let attempts = match &self.link_state {
+            LinkState::Up => 0,
+            LinkState::Down { attempts, .. } => *attempts,
+        };
+        if attempts == 0 {
+            self.context.say(Severity::Warning, format!("bus {}: the link is down: {reason}", self.name));
+        }
+        if let Some(in_flight) = self.in_flight.take() {
+            self.request_ended(in_flight, Err(RequestError::Link(reason.clone())));
+        }
+        for device in &mut self.devices {
+            device.lose(self.now, &format!("the link is down: {reason}"), &mut self.context);
+        }
+        self.link_state = LinkState::Down { reason: Some(reason), attempts: attempts + 1 };
+        let after = Duration::from_millis(500 << attempts.min(6)).min(Duration::from_secs(15));
+        self.context.actions.push_back(Action::Reopen { after });
+    }
+
+    // What happened to a request.
+
+    fn reply(&mut self, reply: Reply) {
+        let Some(in_flight) = self.in_flight.take() else { return };
+        self.counters.count_result(&reply.result);
+        self.counters.count_discarded(reply.discarded);
+        let device = &mut self.devices[in_flight.device];
+        device.count(self.now, &reply);
+        self.load.add(in_flight.sent_at.max(reply.sent_at), self.now);
+        self.request_ended(in_flight, reply.result);
+    }
+
+    fn request_ended(
+        &mut self,
+        in_flight: InFlight,
+        result: Result<crate::engine::modbus::Answer, RequestError>,
+    ) {
+        let device = &mut self.devices[in_flight.device];
+        match in_flight.purpose {
+            Purpose::Identify => device.identified(self.now, result, &mut self.context),
+            Purpose::Poll { read } => device.polled(self.now, read, result, &mut self.context),
+            Purpose::Command => self.command_answered(in_flight.device, result),
+        }
+    }
+
+    // What somebody wants.
+
+    fn command(&mut self, command: Command) {
+        let Some((device, point)) = self.find(&command.device, &command.point) else { return };
+        if command.retained {
+            if self.devices[device].warn_of_retained(point) {
+                let topic = self.context.gateway.topics.set(&command.device, &command.point);
+                self.context
+                    .say(Severity::Warning, format!("a retained message on `{topic}` is ignored; delete it"));
+            }
+            return;
+        }
+        let waiting =
+            Waiting::new(self.now, device, point, command.payload, self.devices[device].details(point));
+        for (replaced, reason) in self.waiting.push(waiting) {
+            self.end_command(
+                replaced.device,
+                replaced.point,
+                Outcome::new(OutcomeKind::Expired, &replaced.wanted, reason),
+            );
+        }
+    }
+
+    fn get(&mut self, device: &str, point: &str) {
+        if let Some((device, point)) = self.find(device, point) {
+            self.devices[device].want(point);
+        }
+    }
+
+    fn find(&self, device: &str, point: &str) -> Option<(usize, PointIndex)> {
+        let index = self.devices.iter().position(|state| state.name() == device)?;
+        Some((index, self.devices[index].point_named(point)?))
+    }
+
+    fn expire_commands(&mut self) {
+        for waiting in self.waiting.take_expired(self.now) {
+            let reason = self.devices[waiting.device].why_not(waiting.point);
+            self.end_command(
+                waiting.device,
+                waiting.point,
+                Outcome::new(OutcomeKind::Expired, &waiting.wanted, reason),
+            );
+        }
+    }
+
+    fn refuse_what_waits(&mut self) {
+        for waiting in self.waiting.take_all() {
+            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, "busker stops");
+            self.end_command(waiting.device, waiting.point, outcome);
+        }
+        if self.in_flight.is_none() {
+            for device in &mut self.devices {
+                device.say_offline(&mut self.context);
+            }
+        }
+    }
+
+    fn end_command(&mut self, device: usize, point: PointIndex, outcome: Outcome) {
+        let state = &self.devices[device];
+        let topic = self.context.gateway.topics.outcome(state.name(), &state.details(point).name);
+        self.context.publish(Message::once(topic, outcome.to_json()));
+    }
+
+    // What to ask next.
+
+    fn ask_next(&mut self) {
+        while self.in_flight.is_none() && self.link_state == LinkState::Up {
+            if self.begin_command() {
+                continue;
+            }
+            let now = self.now;
+            let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+            let urgent = candidates.filter_map(|(index, device)| {
+                device.most_urgent(now).map(|(polled, urgency)| (index, polled, urgency, device.served_at()))
+            });
+            // Of two equally urgent ones, that which has waited longest.
+            let next = urgent.reduce(|best, other| {
+                let better = other.2 > best.2 || (other.2 == best.2 && other.3 < best.3);
+                if better { other } else { best }
+            });
+            let Some((device, polled, ..)) = next else { return };
+            let (call, purpose) = match polled {
+                Polled::Identification(call) => (call, Purpose::Identify),
+                Polled::Read(read, call) => (call, Purpose::Poll { read }),
+            };
+            self.send(device, call, purpose);
+        }
+    }
+
+    /// A device whose watchdog must run out is not spoken to while the broker is away.
+    fn may_ask(&self, device: &DeviceState) -> bool {
+        self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog()
+    }
+
+    /// Begins the first waiting command whose device can take it. Whether anything was done.
+    fn begin_command(&mut self) -> bool {
+        if self.active.is_some() {
+            return false;
+        }
+        let devices = &self.devices;
+        let Some(waiting) =
+            self.waiting.take_first(|waiting| devices[waiting.device].can_take(waiting.point))
+        else {
+            return false;
+        };
+        let state = &mut self.devices[waiting.device];
+        let (flow, step) = CommandFlow::begin(state.device(), waiting.point, &waiting.wanted, state.known());
+        self.active = flow.map(|flow| (waiting.device, flow));
+        self.take_step(waiting.device, waiting.point, step);
+        true
+    }
+
+    fn command_answered(
+        &mut self,
+        device: usize,
+        result: Result<crate::engine::modbus::Answer, RequestError>,
+    ) {
+        let Some((_, mut flow)) = self.active.take() else { return };
+        let point = flow.point();
+        if let (true, Ok(answer)) = (flow.reads(), &result) {
+            let words = command::words_of(answer);
+            self.devices[device].read_for_command(self.now, point, &words, &mut self.context);
+        }
+        let step = flow.answered(self.devices[device].device(), self.devices[device].known(), &result);
+        self.active = Some((device, flow));
+        self.take_step(device, point, step);
+    }
+
+    fn take_step(&mut self, device: usize, point: PointIndex, step: Step) {
+        match step {
+            Step::Ask(call) => {
+                if call.is_write() {
+                    let persistent = self.devices[device].details(point).persistent;
+                    self.counters.writes += 1;
+                    self.counters.persistent_writes += u64::from(persistent);
+                    self.devices[device].about_to_write(self.now, point, &mut self.context);
+                }
+                self.send(device, call, Purpose::Command);
+            }
+            Step::Finished(outcome) => {
+                self.active = None;
+                self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
+                self.end_command(device, point, outcome);
+            }
+        }
+    }
+
+    fn send(&mut self, device: usize, call: Call, purpose: Purpose) {
+        let state = &mut self.devices[device];
+        if let Purpose::Poll { read } = purpose {
+            state.begin_read(read, self.now);
+        }
+        let timeout = state.timeout(self.response_timeout);
+        let not_before = state.asked(self.now);
+        let request = state.request(call);
+        self.in_flight = Some(InFlight { device, purpose, sent_at: not_before });
+        self.context.actions.push_back(Action::Send { request, not_before, timeout });
+    }
+}
+
+/// The share of time in which the wire is busy: two buckets of a minute.
+#[derive(Clone, Copy, Debug, Default)]
+struct Load {
+    minute: u64,
+    busy: Duration,
+    busy_before: Option<Duration>,
+}
+
+impl Load {
+    const MINUTE: u64 = 60_000_000;
+
+    fn add(&mut self, from: Time, until: Time) {
+        let minute = until.0 / Load::MINUTE;
+        if minute != self.minute {
+            self.busy_before = Some(if minute == self.minute + 1 { self.busy } else { Duration::ZERO });
+            (self.minute, self.busy) = (minute, Duration::ZERO);
+        }
+        self.busy += until - from;
+    }
+
+    /// 0 to 1, over the last whole minute; before there is one, since the start.
+    fn share(&self, now: Time) -> f64 {
+        let (busy, time) = match (self.busy_before, now.0 / Load::MINUTE) {
+            (_, minute) if minute > self.minute + 1 => (Duration::ZERO, Duration::from_secs(60)),
+            (_, minute) if minute == self.minute + 1 => (self.busy, Duration::from_secs(60)),
+            (Some(before), _) => (before, Duration::from_secs(60)),
+            (None, _) => (self.busy, now - Time::default()),
+        };
+        if time.is_zero() { 0.0 } else { (busy.as_secs_f64() / time.as_secs_f64()).min(1.0) }
+    }
+}
+
+/// The unit of a point as it is told now.
+fn unit_of(device: &DeviceState, point: PointIndex) -> Option<String> {
+    codec::resolve(device.device(), point, device.known()).ok().and_then(|resolved| resolved.unit)
+}
