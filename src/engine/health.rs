@@ -33,6 +33,10 @@ impl Counters {
 
     /// Counts how a request ended.
     pub fn count_result<T>(&mut self, result: &Result<T, RequestError>) {
+        // It never reached the wire.
+        if matches!(result, Err(RequestError::Impossible(_))) {
+            return;
+        }
         self.requests += 1;
         match result {
             Ok(_) => self.answers += 1,
@@ -41,7 +45,7 @@ impl Counters {
             // Counted with what was thrown away.
             Err(RequestError::Checksum) => {}
             Err(RequestError::WrongFrame) => self.wrong_frames += 1,
-            Err(RequestError::Link(_)) => {}
+            Err(RequestError::Link(_) | RequestError::Impossible(_)) => {}
         }
     }
 }

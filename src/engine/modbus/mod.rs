@@ -19,6 +19,16 @@ pub struct Request {
     /// 1 to 247; 0 is a broadcast on a serial line, and an ordinary unit on Modbus TCP.
     pub unit: u8,
     pub call: Call,
+    /// Take an exception of any function code as the answer: the device has the quirk
+    /// `exception_function_varies`.
+    pub any_exception: bool,
+}
+
+impl Request {
+    /// The request to a device that keeps to the specification.
+    pub const fn new(unit: u8, call: Call) -> Request {
+        Request { unit, call, any_exception: false }
+    }
 }
 
 /// What is asked, by function code.
@@ -126,6 +136,8 @@ pub enum RequestError {
     WrongFrame,
     /// The port or the connection broke.
     Link(String),
+    /// Nothing was sent, because no frame can ask this, and why: a broadcast read, 200 registers.
+    Impossible(&'static str),
 }
 
 impl fmt::Display for RequestError {
@@ -136,6 +148,7 @@ impl fmt::Display for RequestError {
             RequestError::Checksum => write!(f, "checksum error"),
             RequestError::WrongFrame => write!(f, "an answer that does not fit the request"),
             RequestError::Link(reason) => write!(f, "link: {reason}"),
+            RequestError::Impossible(reason) => write!(f, "cannot be asked: {reason}"),
         }
     }
 }
