@@ -239,7 +239,8 @@ impl DeviceState {
     }
 
     pub(super) fn request(&self, call: Call) -> Request {
-        Request { unit: self.settings.unit, call }
+        let any_exception = self.settings.device.wire.quirks.exception_function_varies;
+        Request { unit: self.settings.unit, call, any_exception }
     }
 
     /// The point is wanted now, and told even if it has not changed.

@@ -2,11 +2,16 @@
 //!
 //! `pdu` turns calls into bytes and bytes into answers; `rtu` is the guard of a serial line, an
 //! automaton fed with bytes and times that never takes a reply for another's; `tcp` is the same
-//! door for Modbus TCP.
+//! for Modbus TCP, and `guard` the one door to both.
 
+pub mod crc;
 pub mod pdu;
+pub mod rtu_bytes;
+
 pub mod rtu;
 pub mod tcp;
+
+pub mod guard;
 
 use std::fmt;
 

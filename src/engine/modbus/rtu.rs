@@ -1,1 +1,481 @@
+//! The guard of a serial line: an automaton fed with bytes and times that takes no reply for
+//! another's, although RTU frames carry nothing that says which request they answer.
+//!
+//! * Only a whole frame with a right checksum is an answer, and only if unit, function and count
+//!   (or the returned address and value) are those asked for. It is found at any place, so noise
+//!   before and after it does no harm. Everything else is counted and the wait goes on.
+//! * After a request without an answer the line stays silent for a quarantine, in which a late
+//!   reply is dropped. It ends early when that reply comes.
+//! * A reply later than the quarantine may meet the next request. If it differs in unit, function
+//!   or count it is told apart. If it does not, the first reply to such a request is believed only
+//!   if no second one comes before its deadline; if one does, the second is the answer. The limit:
+//!   a device that answers neither in its time nor in the quarantine, but while a later request of
+//!   the same shape waits, and leaves that one unanswered, cannot be told from a good one.
+//! * Some adapters return our own bytes. Such an echo is skipped and remembered: the replies to
+//!   functions 5, 6 and 8 look like it.
 
+use crate::engine::modbus::pdu;
+use crate::engine::modbus::rtu_bytes::{
+    Beginning, Unanswered, beginning, expected_length, frame, late_reply, sort,
+};
+use crate::engine::modbus::{Answer, Discarded, Reply, Request, RequestError};
+use crate::engine::settings::Line;
+use crate::engine::time::{Duration, Time};
+
+/// A silence that ends a damaged frame of full length. Adapters hand bytes over late: the FTDI
+/// latency timer is 16 ms.
+const SILENCE: Duration = Duration::from_millis(20);
+/// A silence that ends a frame of which a part is missing: adapters and serial servers under load
+/// pass frames on in pieces.
+const SILENCE_INSIDE_A_FRAME: Duration = Duration::from_millis(100);
+/// How long a broadcast is given to be obeyed (Modbus over serial line V1.02, 2.4.1: 100 to 200 ms).
+const TURNAROUND: Duration = Duration::from_millis(100);
+/// A line that is never silent is spoken on after this, or it would be lost for good.
+const PATIENCE: Duration = Duration::from_secs(1);
+/// A request unanswered for longer gets no answer any more.
+const LATE_MAX: Duration = Duration::from_secs(10);
+/// The longest frame (2.5.1.1).
+const FRAME_MAX: u32 = 256;
+/// What is heard beyond this without a frame in it is noise.
+const HEARD_MAX: usize = 2048;
+/// As many bytes without any frame are a damaged reply rather than noise.
+const DAMAGED_MIN: u32 = 4;
+
+/// One serial line. For each request: [`Guard::begin`], wait for [`Guard::earliest_send`], send
+/// [`Guard::frame`], [`Guard::sent`]; then whatever comes first of bytes and [`Guard::wake_at`],
+/// until a reply is returned.
+#[derive(Debug)]
+pub struct Guard {
+    line: Line,
+    gap: Duration,
+    /// `None`: as long as the request's own timeout.
+    quarantine: Option<Duration>,
+    state: State,
+    frame: Vec<u8>,
+    heard: Vec<u8>,
+    /// When each byte of `heard` came.
+    heard_at: Vec<Time>,
+    echo: Echo,
+    /// When the last byte was on the wire, in either direction.
+    busy_until: Option<Time>,
+    quarantine_until: Option<Time>,
+    unanswered: Vec<Unanswered>,
+    discarded: Discarded,
+}
+
+#[derive(Debug)]
+enum State {
+    Idle,
+    Begun { request: Request, timeout: Duration, at: Time },
+    Waiting(Waiting),
+}
+
+/// A request on its way.
+#[derive(Clone, Debug)]
+struct Waiting {
+    request: Request,
+    timeout: Duration,
+    sent_at: Time,
+    /// When its last byte has left.
+    transmitted_at: Time,
+    deadline: Time,
+    /// How many bytes were there at the last look after a silence.
+    looked_at: usize,
+}
+
+/// Whether this line returns what we send.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Echo {
+    Unknown,
+    Yes,
+    No,
+}
+
+/// A reply's place in what was heard.
+struct Found {
+    start: usize,
+    end: usize,
+    result: Result<Answer, RequestError>,
+}
+
+impl Guard {
+    /// `gap`: silence before each request, `None`: the line's own. `quarantine`: how long the line
+    /// stays silent after a request timed out, `None`: as long as that request's timeout.
+    pub fn new(line: Line, gap: Option<Duration>, quarantine: Option<Duration>) -> Guard {
+        Guard {
+            line,
+            gap: whole_micros(gap.unwrap_or_else(|| line.frame_gap())),
+            quarantine,
+            state: State::Idle,
+            frame: Vec::new(),
+            heard: Vec::new(),
+            heard_at: Vec::new(),
+            echo: Echo::Unknown,
+            busy_until: None,
+            quarantine_until: None,
+            unanswered: Vec::new(),
+            discarded: Discarded::default(),
+        }
+    }
+
+    /// Takes the next request. A reply at once means that it cannot be asked on this line.
+    pub fn begin(&mut self, now: Time, request: &Request, timeout: Duration) -> Option<Reply> {
+        if request.unit == 0 && !request.call.is_write() {
+            return Some(self.impossible(now, "nobody answers to a broadcast, so it can only write"));
+        }
+        match pdu::encode(&request.call) {
+            Err(reason) => Some(self.impossible(now, reason)),
+            Ok(pdu) => {
+                self.frame = frame(request.unit, &pdu);
+                self.unanswered.retain(|late| now.since(late.at) < LATE_MAX);
+                self.state = State::Begun { request: request.clone(), timeout, at: now };
+                None
+            }
+        }
+    }
+
+    /// When the frame may be sent: after the quarantine and the silent gap. Ask again after each
+    /// byte that comes before.
+    pub fn earliest_send(&self, now: Time) -> Time {
+        let begun = match &self.state {
+            State::Begun { at, .. } => *at,
+            _ => now,
+        };
+        let quarantine = self.quarantine_until.unwrap_or(begun);
+        let silent = self.busy_until.map_or(begun, |busy| busy + self.gap);
+        silent.min(begun.max(quarantine) + PATIENCE).max(quarantine)
+    }
+
+    /// The bytes to send.
+    pub fn frame(&self) -> &[u8] {
+        &self.frame
+    }
+
+    /// The frame was handed to the line at `now`.
+    pub fn sent(&mut self, now: Time) {
+        let State::Begun { request, timeout, .. } = std::mem::replace(&mut self.state, State::Idle) else {
+            return;
+        };
+        self.drop_strays(self.heard.len());
+        self.quarantine_until = None;
+        let transmitted_at = now + self.line.characters(self.frame.len() as u32);
+        self.busy_until = Some(transmitted_at);
+        let wait = if request.unit == 0 { TURNAROUND } else { timeout };
+        let deadline = transmitted_at + wait;
+        self.state = State::Waiting(Waiting {
+            request,
+            timeout,
+            sent_at: now,
+            transmitted_at,
+            deadline,
+            looked_at: 0,
+        });
+    }
+
+    /// Bytes were read at `now`.
+    pub fn received(&mut self, now: Time, bytes: &[u8]) -> Option<Reply> {
+        self.heard.extend_from_slice(bytes);
+        self.heard_at.resize(self.heard.len(), now);
+        self.busy_until = Some(self.busy_until.map_or(now, |busy| busy.max(now)));
+        if self.heard.len() > HEARD_MAX {
+            self.drop_strays(self.heard.len() - HEARD_MAX / 2);
+        }
+        match &self.state {
+            State::Waiting(waiting) if waiting.request.unit != 0 => {
+                let waiting = waiting.clone();
+                let found = self.trusted_reply(&waiting, false)?;
+                Some(self.answered(waiting, found))
+            }
+            State::Waiting(_) => None,
+            State::Idle | State::Begun { .. } => {
+                self.notice_late_reply();
+                None
+            }
+        }
+    }
+
+    /// When to call [`Guard::wake`].
+    pub fn wake_at(&self) -> Option<Time> {
+        let State::Waiting(waiting) = &self.state else { return None };
+        if waiting.request.unit == 0 {
+            return Some(waiting.deadline);
+        }
+        let deadline = self.deadline(waiting);
+        match self.silent_at(waiting) {
+            Some(silent) if self.heard.len() != waiting.looked_at => Some(silent.min(deadline)),
+            _ => Some(deadline),
+        }
+    }
+
+    /// Decides what only time can tell.
+    pub fn wake(&mut self, now: Time) -> Option<Reply> {
+        let State::Waiting(waiting) = &mut self.state else { return None };
+        if waiting.request.unit == 0 {
+            let (sent_at, over) = (waiting.sent_at, now >= waiting.deadline);
+            return over.then(|| self.obeyed(sent_at));
+        }
+        let mut waiting = waiting.clone();
+        if self.silent_at(&waiting).is_some_and(|silent| now >= silent) {
+            waiting.looked_at = self.heard.len();
+            self.state = State::Waiting(waiting.clone());
+            if let Some(found) = self.trusted_reply(&waiting, true) {
+                return Some(self.answered(waiting, found));
+            }
+            if let Some(reply) = self.damaged_reply(&waiting) {
+                return Some(reply);
+            }
+        }
+        if now < self.deadline(&waiting) {
+            return None;
+        }
+        Some(match self.reply_from(&waiting, 0, true) {
+            Some(found) => self.answered(waiting, found),
+            None => self.unanswered(now, waiting),
+        })
+    }
+
+    /// The port or connection broke; what is known of the line is forgotten.
+    pub fn link_lost(&mut self, now: Time, reason: &str) -> Option<Reply> {
+        let state = std::mem::replace(&mut self.state, State::Idle);
+        self.drop_strays(self.heard.len());
+        self.unanswered.clear();
+        self.quarantine_until = None;
+        self.busy_until = None;
+        self.echo = Echo::Unknown;
+        let sent_at = match state {
+            State::Idle => return None,
+            State::Begun { .. } => now,
+            State::Waiting(waiting) => waiting.sent_at,
+        };
+        Some(self.reply(Err(RequestError::Link(reason.to_owned())), sent_at, None))
+    }
+
+    /// The reply that can be delivered without waiting longer.
+    fn trusted_reply(&self, waiting: &Waiting, silent: bool) -> Option<Found> {
+        let first = self.reply_from(waiting, 0, silent)?;
+        if !self.could_be_late(&first) {
+            return Some(first);
+        }
+        self.reply_from(waiting, first.end, silent)
+    }
+
+    /// Whether the reply fits an earlier request as well. A repeated write confirms the same
+    /// either way.
+    fn could_be_late(&self, found: &Found) -> bool {
+        let bytes = &self.heard[found.start..found.end];
+        found.result != Ok(Answer::Written) && late_reply(bytes, &self.unanswered, &[]).is_some()
+    }
+
+    /// The first whole reply from `start` on. One that has begun earlier and may still become whole
+    /// has the first word, until the line has fallen `silent`.
+    fn reply_from(&self, waiting: &Waiting, start: usize, silent: bool) -> Option<Found> {
+        let mut at = start;
+        let mut echoes = 0;
+        while at < self.heard.len() {
+            let rest = &self.heard[at..];
+            if rest.starts_with(&self.frame) && self.is_echo(waiting, at + self.frame.len() - 1, echoes) {
+                echoes += 1;
+                at += self.frame.len();
+                continue;
+            }
+            match beginning(rest, &waiting.request) {
+                Beginning::Reply(length, result) => {
+                    return Some(Found { start: at, end: at + length, result });
+                }
+                Beginning::Open if !silent => return None,
+                Beginning::Open | Beginning::Other => at += 1,
+            }
+        }
+        None
+    }
+
+    /// Whether a copy of the request, complete with byte number `last`, is an echo and not the
+    /// reply of a function that returns its request.
+    fn is_echo(&self, waiting: &Waiting, last: usize, echoes: usize) -> bool {
+        if !self.reply_looks_like_echo(waiting) {
+            return true;
+        }
+        let too_late = self.heard_at[last] > waiting.transmitted_at + SILENCE;
+        echoes == 0 && !too_late && self.echo != Echo::No
+    }
+
+    fn reply_looks_like_echo(&self, waiting: &Waiting) -> bool {
+        matches!(beginning(&self.frame, &waiting.request), Beginning::Reply(length, _) if length == self.frame.len())
+    }
+
+    /// When the bytes heard are over, whole or not.
+    fn silent_at(&self, waiting: &Waiting) -> Option<Time> {
+        let whole = expected_length(&waiting.request.call).is_some_and(|length| self.heard.len() >= length);
+        let silence = if whole { SILENCE } else { SILENCE_INSIDE_A_FRAME };
+        self.heard_at.last().map(|last| *last + silence)
+    }
+
+    /// The request's deadline, put off while bytes flow, though not for ever.
+    fn deadline(&self, waiting: &Waiting) -> Time {
+        let latest = waiting.deadline + self.line.characters(FRAME_MAX) + SILENCE_INSIDE_A_FRAME;
+        let silent = self.silent_at(waiting).unwrap_or(waiting.deadline);
+        waiting.deadline.max(silent.min(latest))
+    }
+
+    /// The error that can be told before the deadline: a reply came, but damaged.
+    fn damaged_reply(&mut self, waiting: &Waiting) -> Option<Reply> {
+        let sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
+        let expected = expected_length(&waiting.request.call);
+        let alone = sorted.discarded.noise_bytes as usize == self.heard.len();
+        let looks_damaged = sorted.damaged > 0 || (alone && Some(self.heard.len()) == expected);
+        // A damaged echo begins like a damaged reply.
+        let echo_possible = self.echo != Echo::No && sorted.discarded.echoes == 0;
+        if !looks_damaged || (echo_possible && sorted.damaged <= self.frame.len()) {
+            return None;
+        }
+        // The reply may have been something else that only looked like it, unless it was all there.
+        if Some(sorted.damaged) != expected || echo_possible {
+            self.quarantine_until = Some(waiting.deadline);
+            self.remember(waiting, self.heard_at.last().copied().unwrap_or(waiting.deadline));
+        }
+        Some(self.failed(waiting.clone(), true))
+    }
+
+    /// The deadline has passed.
+    fn unanswered(&mut self, now: Time, waiting: Waiting) -> Reply {
+        let reply = self.failed(waiting.clone(), false);
+        self.quarantine_until = Some(now + self.quarantine.unwrap_or(waiting.timeout));
+        self.remember(&waiting, now);
+        reply
+    }
+
+    fn remember(&mut self, waiting: &Waiting, at: Time) {
+        self.unanswered.push(Unanswered { request: waiting.request.clone(), at });
+    }
+
+    /// Ends a request without an answer, with the error that what was heard amounts to.
+    fn failed(&mut self, waiting: Waiting, damaged: bool) -> Reply {
+        let mut sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
+        let heard = &mut sorted.discarded;
+        if heard.checksum_errors == 0
+            && (damaged || heard.noise_bytes >= DAMAGED_MIN && heard.foreign_frames == 0)
+        {
+            heard.checksum_errors = 1;
+            heard.noise_bytes = 0;
+        }
+        let error = if heard.checksum_errors > 0 {
+            RequestError::Checksum
+        } else if heard.foreign_frames > 0 {
+            RequestError::WrongFrame
+        } else {
+            RequestError::Timeout
+        };
+        if heard.echoes > 0 && !self.reply_looks_like_echo(&waiting) {
+            self.echo = Echo::Yes;
+        }
+        self.count(sorted.discarded);
+        self.forget(&sorted.late);
+        let first = self.heard_at.first().copied();
+        let last = self.heard_at.last().copied();
+        self.clear(self.heard.len());
+        self.state = State::Idle;
+        self.reply(Err(error), waiting.sent_at, first.zip(last))
+    }
+
+    fn answered(&mut self, waiting: Waiting, found: Found) -> Reply {
+        let sorted = sort(&self.heard[..found.start], &self.frame, Some(&waiting.request), &self.unanswered);
+        let too_late_for_an_echo = self.heard_at[found.end - 1] > waiting.transmitted_at + SILENCE;
+        if sorted.discarded.echoes > 0 {
+            self.echo = Echo::Yes;
+        } else if !self.reply_looks_like_echo(&waiting) || too_late_for_an_echo {
+            self.echo = Echo::No;
+        }
+        self.count(sorted.discarded);
+        self.forget(&sorted.late);
+        // Units answer in order: no older request of this one gets a reply any more.
+        self.unanswered.retain(|late| late.request.unit != waiting.request.unit);
+        let times = (self.heard_at[found.start], self.heard_at[found.end - 1]);
+        self.clear(found.end);
+        self.state = State::Idle;
+        self.reply(found.result, waiting.sent_at, Some(times))
+    }
+
+    /// A broadcast has had its time.
+    fn obeyed(&mut self, sent_at: Time) -> Reply {
+        let sorted = sort(&self.heard, &self.frame, None, &self.unanswered);
+        // Nobody replies, so a copy of the request can only be an echo.
+        self.echo = if sorted.discarded.echoes > 0 { Echo::Yes } else { Echo::No };
+        self.count(sorted.discarded);
+        self.forget(&sorted.late);
+        self.clear(self.heard.len());
+        self.state = State::Idle;
+        self.reply(Ok(Answer::Written), sent_at, None)
+    }
+
+    fn impossible(&mut self, now: Time, reason: &'static str) -> Reply {
+        self.reply(Err(RequestError::Impossible(reason)), now, None)
+    }
+
+    fn reply(
+        &mut self,
+        result: Result<Answer, RequestError>,
+        sent_at: Time,
+        times: Option<(Time, Time)>,
+    ) -> Reply {
+        Reply {
+            result,
+            sent_at,
+            first_byte_at: times.map(|(first, _)| first),
+            last_byte_at: times.map(|(_, last)| last),
+            discarded: std::mem::take(&mut self.discarded),
+        }
+    }
+
+    /// Between requests: a late reply ends the quarantine that waits for it.
+    fn notice_late_reply(&mut self) {
+        for at in 0..self.heard.len() {
+            if let Some((index, length)) = late_reply(&self.heard[at..], &self.unanswered, &[]) {
+                // The quarantine waits for the last one.
+                if index + 1 == self.unanswered.len() {
+                    self.quarantine_until = None;
+                }
+                self.drop_strays(at + length);
+                return;
+            }
+        }
+    }
+
+    /// Counts and drops the first `count` bytes, which answer nothing that is asked now.
+    fn drop_strays(&mut self, count: usize) {
+        let sorted = sort(&self.heard[..count], &[], None, &self.unanswered);
+        self.count(sorted.discarded);
+        self.forget(&sorted.late);
+        self.clear(count);
+    }
+
+    fn clear(&mut self, count: usize) {
+        self.heard.drain(..count);
+        self.heard_at.drain(..count);
+    }
+
+    fn forget(&mut self, late: &[usize]) {
+        let mut index = 0;
+        self.unanswered.retain(|_| {
+            index += 1;
+            !late.contains(&(index - 1))
+        });
+    }
+
+    fn count(&mut self, more: Discarded) {
+        let sum = &mut self.discarded;
+        sum.noise_bytes += more.noise_bytes;
+        sum.late_replies += more.late_replies;
+        sum.foreign_frames += more.foreign_frames;
+        sum.echoes += more.echoes;
+        sum.checksum_errors += more.checksum_errors;
+    }
+}
+
+/// Rounded up to what [`Time`] can tell: a gap is never a microsecond short.
+fn whole_micros(duration: Duration) -> Duration {
+    Duration::from_micros(duration.as_nanos().div_ceil(1000) as u64)
+}
+
+#[cfg(test)]
+#[path = "rtu_tests.rs"]
+mod tests;
