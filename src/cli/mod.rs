@@ -12,6 +12,7 @@
 //! `main.rs` prints it and chooses the exit code.
 
 pub mod output;
+mod simulate;
 
 use clap::{Parser, Subcommand};
 
@@ -33,7 +34,9 @@ macro_rules! verbs {
     };
 }
 
-verbs! {}
+verbs! {
+    simulate Simulate,
+}
 
 /// Connects Modbus devices to Home Assistant and to anything that speaks MQTT.
 #[derive(Parser)]

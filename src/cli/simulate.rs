@@ -1,0 +1,149 @@
+//! `busker simulate`: simulated devices on pseudo-terminals and sockets.
+
+use std::io::BufRead;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::Context;
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::{Failure, output};
+use crate::engine::time::Duration;
+use crate::simulator::script::{parse_duration, parse_script};
+use crate::simulator::{DeviceAt, Fault, Framing, LineSettings, Options, Parity, Simulation, Told};
+
+/// Serve simulated devices, as their manuals describe them
+///
+/// The devices share one line: each answers its own unit. What they measure is changed by commands,
+/// from a script or as lines on standard input; what their outputs do is told on standard output.
+#[derive(Debug, clap::Args)]
+#[command(after_help = help())]
+pub struct Args {
+    /// The devices, each with its unit: `metz-connect/mr-do4@18`
+    #[arg(value_name = "PROFILE@UNIT", required = true)]
+    devices: Vec<DeviceAt>,
+    /// Serve RTU on a pseudo-terminal, with a symbolic link to it here
+    #[arg(long, value_name = "LINK", required_unless_present_any = ["tcp", "rtu_over_tcp"])]
+    pty: Vec<PathBuf>,
+    /// Serve Modbus TCP here; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    tcp: Vec<String>,
+    /// Serve RTU over TCP here, as serial servers do; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    rtu_over_tcp: Vec<String>,
+    /// The line's bit rate: how long the silence between frames is
+    #[arg(long, value_name = "RATE", default_value_t = 19200, value_parser = clap::value_parser!(u32).range(300..=1_000_000))]
+    baud: u32,
+    /// The line's parity: even, odd or none
+    #[arg(long, default_value = "even", value_parser = parity)]
+    parity: Parity,
+    /// How long a device thinks before it replies
+    #[arg(long, value_name = "TIME", default_value = "5ms", value_parser = parse_duration)]
+    turnaround: Duration,
+    /// Let requests and replies take the time that they would take on a wire
+    #[arg(long)]
+    paced: bool,
+    /// Keep the EEPROMs in this directory
+    #[arg(long, value_name = "DIR")]
+    state_dir: Option<PathBuf>,
+    /// Misbehave: `unit=19,silent`, `garbled,every=3`; see below
+    #[arg(long, value_name = "FAULT")]
+    fault: Vec<Fault>,
+    /// Do the commands of this file at their times
+    #[arg(long, value_name = "FILE")]
+    script: Option<PathBuf>,
+}
+
+fn help() -> String {
+    use crate::simulator::{Model, fault::KINDS, script::COMMANDS};
+    let profiles = Model::ALL.map(|model| format!("  {model}\n")).concat();
+    format!(
+        "Devices:\n{profiles}\n\
+         Commands, in a script and on standard input:\n{COMMANDS}\n\
+         Faults, each for all units or with `unit=N`, for all requests or with `every=N`:\n  {KINDS}\n\n\
+         Example:\n  \
+         busker simulate metz-connect/mr-do4@18 metz-connect/mr-si4@20 --pty /tmp/line --tcp 127.0.0.1:1502\n  \
+         and then, on its standard input:\n  \
+         unit 18 relay 2 hand on\n  \
+         at 5s unit 20 input 1 pulses 100 every 80ms"
+    )
+}
+
+fn parity(name: &str) -> Result<Parity, String> {
+    Parity::from_name(name).ok_or_else(|| "a parity is `even`, `odd` or `none`".into())
+}
+
+/// Serves until interrupted.
+pub fn run(args: Args) -> Result<(), Failure> {
+    let steps = match &args.script {
+        Some(path) => {
+            let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+            parse_script(&text).map_err(|errors| {
+                Failure::Faults(errors.iter().map(|error| format!("{}: {error}", path.display())).collect())
+            })?
+        }
+        None => Vec::new(),
+    };
+    let options = Options {
+        line: LineSettings { baud: args.baud, parity: args.parity },
+        turnaround: args.turnaround,
+        paced: args.paced,
+        state_dir: args.state_dir,
+        faults: args.fault,
+    };
+    let simulation = Simulation::new(&args.devices, options).map_err(Failure::wrong_input)?;
+    simulation.listen(tell);
+    let mut doors: Vec<Box<dyn std::any::Any>> = Vec::new();
+    for link in args.pty {
+        let port = simulation.serve_pty(Some(link))?;
+        output::print(&format!("pty {}\n", port.path().display()))?;
+        doors.push(Box::new(port));
+    }
+    let addresses = args.tcp.iter().map(|address| ("tcp", address, Framing::Tcp));
+    let rtu = args.rtu_over_tcp.iter().map(|address| ("rtu_over_tcp", address, Framing::Rtu));
+    for (name, address, framing) in addresses.chain(rtu) {
+        let port = simulation.serve_tcp(address, framing)?;
+        output::print(&format!("{name} {}\n", port.address()))?;
+        doors.push(Box::new(port));
+    }
+    simulation.run_script(steps).map_err(Failure::wrong_input)?;
+    let simulation = Arc::new(simulation);
+    obey_standard_input(&simulation)?;
+    wait_for_the_end()
+}
+
+fn tell(told: &Told) {
+    match told {
+        // Who reads no more loses nothing but lines about what he asked for himself.
+        Told::Event(event) => drop(output::print(&format!("{event}\n"))),
+        Told::Problem(problem) => eprintln!("error: {problem}"),
+    }
+}
+
+/// Does each line of standard input. The thread ends with it, or with the program.
+fn obey_standard_input(simulation: &Arc<Simulation>) -> anyhow::Result<()> {
+    let simulation = Arc::downgrade(simulation);
+    std::thread::Builder::new().name("standard input".into()).spawn(move || {
+        for line in std::io::stdin().lock().lines() {
+            let (Ok(line), Some(simulation)) = (line, simulation.upgrade()) else { return };
+            if let Err(error) = simulation.command(&line) {
+                eprintln!("error: {error}");
+            }
+        }
+    })?;
+    Ok(())
+}
+
+/// Waits for an interrupt or a request to terminate.
+fn wait_for_the_end() -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(async {
+        let (mut interrupt, mut terminate) =
+            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+        Ok(())
+    })
+}

@@ -1,0 +1,232 @@
+//! What every simulated device can do, whatever it is: answer, age, restart, be touched, be looked at.
+
+use std::fmt;
+
+use crate::engine::time::{Duration, Time};
+use crate::simulator::metz_connect::MetzConnect;
+use crate::simulator::metz_connect::mr_do4::MrDo4;
+use crate::simulator::metz_connect::mr_si4::MrSi4;
+
+/// A device on a line. It opens nothing, waits for nothing and is told the time; a caller may let
+/// any amount of time pass between two calls, but never lets it run backwards.
+pub trait SimulatedDevice: Send {
+    /// Answers a request PDU (function code and data, no address, no checksum); `None` is silence.
+    fn request(&mut self, now: Time, addressed: Addressed, pdu: &[u8]) -> Option<Vec<u8>>;
+
+    /// Something else was on the line. Devices with counters count it.
+    fn overhear(&mut self, _heard: Overheard) {}
+
+    /// Lets time pass: delays end, watchdogs expire, pulses arrive.
+    fn advance(&mut self, now: Time);
+
+    /// Starts anew: what is in the EEPROM stays, everything else is as after switching on.
+    fn restart(&mut self, now: Time);
+
+    /// Changes the process side; the error says what this device has instead.
+    fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String>;
+
+    /// What a person in front of the device sees: `relay_1` `ON`.
+    fn outputs(&self) -> Vec<(String, String)>;
+
+    /// The EEPROM as words, always as many; see [`SimulatedDevice::load_eeprom`].
+    fn eeprom(&self) -> Vec<u16>;
+
+    /// Puts a stored EEPROM back and restarts. The error says how many words it should have been.
+    fn load_eeprom(&mut self, now: Time, words: &[u16]) -> Result<(), String>;
+
+    /// The bit rate and parity that this device listens with; `None`: always those of its line.
+    fn line_settings(&self) -> Option<LineSettings> {
+        None
+    }
+
+    /// A device that cannot answer within this time does not answer at all.
+    fn gives_up_after(&self) -> Option<Duration> {
+        None
+    }
+}
+
+/// Whom a request was meant for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Addressed {
+    /// This device alone.
+    Unit,
+    /// Every device on the line (unit 0): obeyed, never answered.
+    Broadcast,
+}
+
+/// What a device hears although it is not meant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Overheard {
+    /// A whole frame for another unit.
+    Foreign,
+    /// A frame with a wrong checksum, or a fragment.
+    Damaged,
+}
+
+/// A change of the process side. Numbers count from 1, as on the terminals.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Stimulus {
+    /// A hand switch of a relay.
+    Hand { relay: u8, position: Hand },
+    /// What is connected to an input.
+    Input { input: u8, signal: Signal },
+    /// Somebody presses the button at the device's front.
+    Button,
+}
+
+/// The position of a hand switch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Hand {
+    Automatic,
+    On,
+    Off,
+}
+
+/// What an input sees.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Signal {
+    /// Nothing connected.
+    Open,
+    Ohms(f64),
+    Volts(f64),
+    /// The temperature at a sensor of the kind that the input is configured for.
+    Celsius(f64),
+    /// A contact, closed or open.
+    Contact(bool),
+    /// So many closings of a contact, one after the other.
+    Pulses {
+        count: u64,
+        every: Duration,
+    },
+    /// Sets a pulse counter as if it had counted that far.
+    Counter(u64),
+}
+
+/// A line's bit rate and parity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LineSettings {
+    pub baud: u32,
+    pub parity: Parity,
+}
+
+impl Default for LineSettings {
+    /// 19200 and even: what the specification asks for and these devices leave the factory with.
+    fn default() -> LineSettings {
+        LineSettings { baud: 19200, parity: Parity::Even }
+    }
+}
+
+impl fmt::Display for LineSettings {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", self.baud, self.parity)
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Parity {
+    Even,
+    Odd,
+    None,
+}
+
+impl Parity {
+    pub fn from_name(name: &str) -> Option<Parity> {
+        [Parity::Even, Parity::Odd, Parity::None].into_iter().find(|parity| parity.to_string() == name)
+    }
+}
+
+impl fmt::Display for Parity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Parity::Even => "even",
+            Parity::Odd => "odd",
+            Parity::None => "none",
+        })
+    }
+}
+
+/// The devices there are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Model {
+    MrDo4,
+    MrSi4,
+}
+
+impl Model {
+    pub const ALL: [Model; 2] = [Model::MrDo4, Model::MrSi4];
+
+    /// The identifier of the device's profile.
+    pub const fn id(self) -> &'static str {
+        match self {
+            Model::MrDo4 => "metz-connect/mr-do4",
+            Model::MrSi4 => "metz-connect/mr-si4",
+        }
+    }
+
+    pub fn from_id(id: &str) -> Option<Model> {
+        Model::ALL.into_iter().find(|model| model.id() == id)
+    }
+
+    /// A device fresh from the factory, its switches set to the line's settings, switched on at `now`.
+    pub fn build(self, now: Time, line: LineSettings) -> Box<dyn SimulatedDevice> {
+        match self {
+            Model::MrDo4 => Box::new(MetzConnect::new(now, line, MrDo4::new(now))),
+            Model::MrSi4 => Box::new(MetzConnect::new(now, line, MrSi4::new(now))),
+        }
+    }
+}
+
+impl fmt::Display for Model {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.id())
+    }
+}
+
+/// One device to simulate: `metz-connect/mr-do4@18`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DeviceAt {
+    pub model: Model,
+    /// 1 to 247.
+    pub unit: u8,
+}
+
+impl std::str::FromStr for DeviceAt {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<DeviceAt, String> {
+        let (id, unit) = text
+            .split_once('@')
+            .ok_or_else(|| format!("`{text}` names no unit; write it as `{}@18`", Model::MrDo4))?;
+        let known = || Model::ALL.map(|model| format!("`{model}`")).join(", ");
+        let model =
+            Model::from_id(id).ok_or_else(|| format!("`{id}` is not simulated; there are {}", known()))?;
+        match unit.parse() {
+            Ok(unit @ 1..=247) => Ok(DeviceAt { model, unit }),
+            _ => Err(format!("`{unit}` is not a unit; a unit is 1 to 247")),
+        }
+    }
+}
+
+impl fmt::Display for DeviceAt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}@{}", self.model, self.unit)
+    }
+}
+
+/// Takes the next `N` words of a stored EEPROM whose length has been checked.
+pub(super) fn take_words<const N: usize>(words: &mut &[u16]) -> [u16; N] {
+    let mut taken = [0; N];
+    let (head, tail) = words.split_at(N.min(words.len()));
+    taken[..head.len()].copy_from_slice(head);
+    *words = tail;
+    taken
+}
+
+/// Whether a stored EEPROM has as many words as this device's.
+pub(super) fn check_eeprom_length(words: &[u16], wanted: usize) -> Result<(), String> {
+    if words.len() == wanted {
+        Ok(())
+    } else {
+        Err(format!("the EEPROM has {} words; this device has {wanted}", words.len()))
+    }
+}

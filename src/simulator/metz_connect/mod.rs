@@ -1,0 +1,340 @@
+//! What all METZ CONNECT devices have in common: the manual's chapter "Allgemein geltende Kommandos"
+//! (Softwarebeschreibung Modbus RTU V2.1, pages 4 and 5), and the identification.
+//!
+//! [`MetzConnect`] is that common part around a [`Module`], which is one device's own chapter.
+
+pub mod mr_do4;
+pub mod mr_si4;
+
+use crate::engine::time::Time;
+use crate::simulator::device::{
+    Addressed, LineSettings, Overheard, Parity, SimulatedDevice, Stimulus, check_eeprom_length,
+};
+use crate::simulator::pdu::{Exception, Request, exception_reply, write_reply};
+
+/// The chapter of one device: its registers, its process side, its EEPROM.
+pub trait Module: Send {
+    const PRODUCT: &'static str;
+    const VERSION: &'static str;
+    /// Its function codes, besides 8 and 43 which all of them have.
+    const FUNCTIONS: &'static [u8];
+
+    /// Answers a request with one of `FUNCTIONS`, for anything but register 65.
+    fn serve(&mut self, now: Time, request: &Request) -> Result<Vec<u8>, Exception>;
+
+    /// A valid message with this device's own address has come, whatever it says.
+    fn message_for_this_device(&mut self, _now: Time) {}
+
+    fn advance(&mut self, now: Time);
+    fn restart(&mut self, now: Time);
+    fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String>;
+    fn outputs(&self) -> Vec<(String, String)>;
+    fn eeprom(&self) -> Vec<u16>;
+    /// Puts back as many words as [`Module::eeprom`] gives.
+    fn load_eeprom(&mut self, words: &[u16]);
+}
+
+/// A METZ CONNECT device.
+pub struct MetzConnect<M> {
+    module: M,
+    /// Register 65, in the EEPROM.
+    line: LineSettings,
+    counters: Counters,
+    /// After function 8/4: hears, and neither obeys nor answers.
+    listen_only: bool,
+}
+
+/// Function 8, sub-functions 11 to 15 (page 5). They wrap, since they are told in one register.
+#[derive(Clone, Copy, Debug, Default)]
+struct Counters {
+    bus_messages: u16,
+    communication_errors: u16,
+    exceptions: u16,
+    device_messages: u16,
+    unanswered: u16,
+}
+
+/// Bit rate and parity (page 4).
+const LINE_REGISTER: u16 = 65;
+/// Without this high byte register 65 is not written (page 4).
+const LINE_MAGIC: u8 = 0x53;
+const BAUD_RATES: [u32; 8] = [1200, 2400, 4800, 9600, 19200, 38400, 57600, 115_200];
+const PARITIES: [Parity; 3] = [Parity::Even, Parity::Odd, Parity::None];
+const VENDOR: &str = "METZ CONNECT GmbH";
+
+impl<M: Module> MetzConnect<M> {
+    pub fn new(_now: Time, line: LineSettings, module: M) -> MetzConnect<M> {
+        MetzConnect { module, line, counters: Counters::default(), listen_only: false }
+    }
+
+    /// Answers, with the counters already advanced for the request itself.
+    fn answer(&mut self, now: Time, pdu: &[u8]) -> Result<Option<Vec<u8>>, Exception> {
+        let function = pdu.first().copied().unwrap_or(0);
+        if function != 8 && function != 43 && !M::FUNCTIONS.contains(&function) {
+            return Err(Exception::Function);
+        }
+        let request = Request::parse(pdu)?;
+        match &request {
+            Request::Diagnostics { sub_function, data } => self.diagnose(now, *sub_function, data),
+            Request::Encapsulated { interface, data } => identify::<M>(*interface, data).map(Some),
+            Request::WriteRegister { address: LINE_REGISTER, word } => {
+                self.set_line(*word)?;
+                Ok(Some(write_reply(function, LINE_REGISTER, *word)))
+            }
+            Request::WriteRegisters { first: LINE_REGISTER, words } if words.len() == 1 => {
+                self.set_line(words[0])?;
+                Ok(Some(write_reply(function, LINE_REGISTER, 1)))
+            }
+            _ => self.module.serve(now, &request).map(Some),
+        }
+    }
+
+    /// Register 65, "Bitrate einstellen über Modbus-Kommando" (page 4). Codes that are in no table
+    /// are refused; the manual itself says only that nothing happens without the magic number.
+    fn set_line(&mut self, word: u16) -> Result<(), Exception> {
+        let [magic, codes] = word.to_be_bytes();
+        let (parity, baud) = (usize::from(codes >> 4), usize::from(codes & 0x0F));
+        if magic != LINE_MAGIC || parity > PARITIES.len() || baud > BAUD_RATES.len() {
+            return Err(Exception::Value);
+        }
+        // "Wenn Parität oder Bitrate 0 ist, erfolgt keine Einstellung und Speicherung."
+        if parity > 0 && baud > 0 {
+            self.line = LineSettings { baud: BAUD_RATES[baud - 1], parity: PARITIES[parity - 1] };
+        }
+        Ok(())
+    }
+
+    /// "Test des Kommunikationssystems" (page 5).
+    fn diagnose(&mut self, now: Time, sub_function: u16, data: &[u8]) -> Result<Option<Vec<u8>>, Exception> {
+        let echo = || {
+            let mut reply = vec![8];
+            reply.extend(sub_function.to_be_bytes());
+            reply.extend(data);
+            reply
+        };
+        let count = match sub_function {
+            0 => return Ok(Some(echo())),
+            1 => {
+                if data != [0, 0] && data != [0xFF, 0] {
+                    return Err(Exception::Value);
+                }
+                let was_listening_only = self.listen_only;
+                self.restart(now);
+                // The specification (6.8): no answer to what ended the listening.
+                return Ok(if was_listening_only { None } else { Some(echo()) });
+            }
+            4 | 10..=15 if data != [0, 0] => return Err(Exception::Value),
+            4 => {
+                self.listen_only = true;
+                return Ok(None);
+            }
+            10 => {
+                self.counters = Counters::default();
+                return Ok(Some(echo()));
+            }
+            11 => self.counters.bus_messages,
+            12 => self.counters.communication_errors,
+            13 => self.counters.exceptions,
+            14 => self.counters.device_messages,
+            15 => self.counters.unanswered,
+            // The specification's diagram for function 8: an unknown sub-function is exception 1.
+            _ => return Err(Exception::Function),
+        };
+        Ok(Some(write_reply(8, sub_function, count)))
+    }
+}
+
+/// Function 43/14 as each chapter's last page gives it: basic identification in one reply.
+fn identify<M: Module>(interface: u8, data: &[u8]) -> Result<Vec<u8>, Exception> {
+    if interface != 14 {
+        return Err(Exception::Function);
+    }
+    let [code, object] = data else { return Err(Exception::Value) };
+    // Only "Geräte ID Code lesen: 0x01" is told, and the conformity level 1 has nothing else.
+    if *code != 1 {
+        return Err(Exception::Value);
+    }
+    let objects = [VENDOR, M::PRODUCT, M::VERSION];
+    // The specification (6.21): an unknown first object begins at the start again.
+    let first = if usize::from(*object) < objects.len() { usize::from(*object) } else { 0 };
+    let mut reply = vec![43, 14, 1, 1, 0, 0, (objects.len() - first) as u8];
+    for (number, text) in objects.iter().enumerate().skip(first) {
+        reply.extend([number as u8, text.len() as u8]);
+        reply.extend(text.as_bytes());
+    }
+    Ok(reply)
+}
+
+impl<M: Module> SimulatedDevice for MetzConnect<M> {
+    fn request(&mut self, now: Time, addressed: Addressed, pdu: &[u8]) -> Option<Vec<u8>> {
+        self.counters.bus_messages = self.counters.bus_messages.wrapping_add(1);
+        self.counters.device_messages = self.counters.device_messages.wrapping_add(1);
+        self.module.advance(now);
+        let ends_listening = pdu.starts_with(&[8, 0, 1]);
+        let reply = if self.listen_only && !ends_listening {
+            None
+        } else {
+            // Elsewhere the manual says of such a timer: it starts anew with each valid message to
+            // the device, only the address matters (page 24). A broadcast is not addressed to it.
+            if addressed == Addressed::Unit {
+                self.module.message_for_this_device(now);
+            }
+            self.answer(now, pdu).unwrap_or_else(|exception| {
+                self.counters.exceptions = self.counters.exceptions.wrapping_add(1);
+                Some(exception_reply(pdu.first().copied().unwrap_or(0), exception))
+            })
+        };
+        let reply = reply.filter(|_| addressed == Addressed::Unit);
+        if reply.is_none() && !ends_listening {
+            self.counters.unanswered = self.counters.unanswered.wrapping_add(1);
+        }
+        reply
+    }
+
+    fn overhear(&mut self, heard: Overheard) {
+        let counter = match heard {
+            Overheard::Foreign => &mut self.counters.bus_messages,
+            Overheard::Damaged => &mut self.counters.communication_errors,
+        };
+        *counter = counter.wrapping_add(1);
+    }
+
+    fn advance(&mut self, now: Time) {
+        self.module.advance(now);
+    }
+
+    fn restart(&mut self, now: Time) {
+        self.counters = Counters::default();
+        self.listen_only = false;
+        self.module.restart(now);
+    }
+
+    fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String> {
+        self.module.advance(now);
+        self.module.stimulate(now, stimulus)
+    }
+
+    fn outputs(&self) -> Vec<(String, String)> {
+        self.module.outputs()
+    }
+
+    fn eeprom(&self) -> Vec<u16> {
+        let parity = PARITIES.iter().position(|parity| *parity == self.line.parity).map_or(0, |at| at + 1);
+        // A bit rate that register 65 has no code for is the line's own: stored as 0, "not set".
+        let baud = BAUD_RATES.iter().position(|baud| *baud == self.line.baud).map_or(0, |at| at + 1);
+        let mut words = vec![(parity << 4 | baud) as u16];
+        words.extend(self.module.eeprom());
+        words
+    }
+
+    fn load_eeprom(&mut self, now: Time, words: &[u16]) -> Result<(), String> {
+        check_eeprom_length(words, self.eeprom().len())?;
+        if self.set_line(words[0] | u16::from(LINE_MAGIC) << 8).is_err() {
+            return Err(format!("`{:04X}` is no code for bit rate and parity", words[0]));
+        }
+        self.module.load_eeprom(&words[1..]);
+        self.restart(now);
+        Ok(())
+    }
+
+    fn line_settings(&self) -> Option<LineSettings> {
+        Some(self.line)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::simulator::device::{Addressed, LineSettings, Model, Overheard, Parity};
+    use crate::simulator::testing::Bench;
+
+    #[test]
+    fn identification_gives_vendor_product_and_version_in_one_reply() {
+        for (model, product) in [(Model::MrDo4, "MR-DO4 V1.4"), (Model::MrSi4, "MR-SI4 V2.1")] {
+            let (name, version) = product.split_once(' ').expect("a name and a version");
+            let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();
+            let mut bench = Bench::new(model);
+            let reply = format!(
+                "2B0E01010000030011{}0106{}0204{}",
+                hex("METZ CONNECT GmbH"),
+                hex(name),
+                hex(version)
+            );
+            bench.check(&[
+                ("2B 0E 01 00", &reply),
+                ("2B 0E 01 07", &reply),
+                ("2B 0E 02 00", "AB 03"),
+                ("2B 0E 04 00", "AB 03"),
+                ("2B 0E 01", "AB 03"),
+            ]);
+        }
+    }
+
+    #[test]
+    fn diagnostics_echo_any_data_and_refuse_other_sub_functions_page_5() {
+        Bench::new(Model::MrDo4).check(&[
+            ("08 0000 1234", "08 0000 1234"),
+            ("08 0000 0102030405", "08 0000 0102030405"),
+            ("08 0000", "08 0000"),
+            ("08 0002 0000", "88 01"),
+            ("08 000A 0001", "88 03"),
+            ("08 0001 1234", "88 03"),
+            ("08 00", "88 03"),
+        ]);
+    }
+
+    #[test]
+    fn diagnostic_counters_count_and_are_cleared_page_5() {
+        let mut bench = Bench::new(Model::MrDo4);
+        bench.check(&[("08 000A 0000", "08 000A 0000"), ("03 0005 0001", "83 02")]);
+        bench.device.overhear(Overheard::Foreign);
+        bench.device.overhear(Overheard::Damaged);
+        assert_eq!(bench.send(Addressed::Broadcast, "05 0000 FF00"), "silence");
+        bench.check(&[
+            // The refused read, the foreign message, the broadcast and this one.
+            ("08 000B 0000", "08 000B 0004"),
+            ("08 000C 0000", "08 000C 0001"),
+            ("08 000D 0000", "08 000D 0001"),
+            ("08 000E 0000", "08 000E 0006"),
+            ("08 000F 0000", "08 000F 0001"),
+            ("08 0001 FF00", "08 0001 FF00"),
+            ("08 000B 0000", "08 000B 0001"),
+            ("08 000D 0000", "08 000D 0000"),
+        ]);
+    }
+
+    #[test]
+    fn a_device_that_only_listens_neither_obeys_nor_answers_until_it_is_restarted_page_5() {
+        Bench::new(Model::MrDo4).check(&[
+            ("08 0004 0000", "silence"),
+            ("05 0000 FF00", "silence"),
+            ("08 0000 1234", "silence"),
+            ("08 0001 0000", "silence"),
+            ("01 0000 0001", "01 01 00"),
+        ]);
+    }
+
+    #[test]
+    fn register_65_sets_bit_rate_and_parity_only_with_its_magic_number_page_4() {
+        let settings = |baud, parity| Some(LineSettings { baud, parity });
+        for (request, reply, now) in [
+            // The manual's example: even parity, 19200.
+            ("06 0041 5315", "06 0041 5315", settings(19200, Parity::Even)),
+            ("06 0041 5338", "06 0041 5338", settings(115_200, Parity::None)),
+            ("10 0041 0001 02 5321", "10 0041 0001", settings(1200, Parity::Odd)),
+            ("06 0041 0038", "86 03", settings(19200, Parity::Even)),
+            ("06 0041 5339", "86 03", settings(19200, Parity::Even)),
+            ("06 0041 5341", "86 03", settings(19200, Parity::Even)),
+            // One of both is 0: nothing is set.
+            ("06 0041 5308", "06 0041 5308", settings(19200, Parity::Even)),
+            ("06 0041 5330", "06 0041 5330", settings(19200, Parity::Even)),
+        ] {
+            let mut bench = Bench::new(Model::MrDo4);
+            bench.check(&[(request, reply)]);
+            assert_eq!(bench.device.line_settings(), now, "{request}");
+            let kept = bench.device.eeprom();
+            let mut other = Bench::new(Model::MrDo4);
+            other.device.load_eeprom(other.now, &kept).expect("an EEPROM of the same device");
+            assert_eq!(other.device.line_settings(), now, "{request} kept");
+        }
+    }
+}

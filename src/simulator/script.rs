@@ -1,0 +1,222 @@
+//! The words in which a person or a file changes the process side.
+//!
+//! ```text
+//! # a comment
+//! unit 18 relay 2 hand on
+//! at 5s unit 19 input 1 ohms 107.8
+//! at 6s unit 20 input 1 pulses 100 every 80ms
+//! ```
+
+use crate::engine::time::Duration;
+use crate::simulator::device::{Hand, Signal, Stimulus};
+use crate::simulator::fault::Fault;
+
+/// What a line of a script does.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Action {
+    Stimulate { unit: u8, stimulus: Stimulus },
+    Power { unit: u8, on: bool },
+    Restart { unit: u8 },
+    Fault(Fault),
+    Repair { unit: u8 },
+}
+
+/// An action and when to do it, counted from the start of the script.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Step {
+    pub after: Duration,
+    pub action: Action,
+}
+
+/// The commands, as the help shows them.
+pub const COMMANDS: &str = "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4)
+  unit N input I ohms X | volts X | celsius X | open
+                                            what is connected to an input (MR-AI8)
+  unit N input I contact closed|open        a contact (MR-SI4)
+  unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
+  unit N input I counter COUNT              sets a pulse counter (MR-SI4)
+  unit N button                             somebody presses the button (MR-SI4)
+  unit N power off|on                       power loss: only the EEPROM is kept
+  unit N restart                            the same, and silent for two seconds
+  unit N fault KIND | none                  see --fault
+  at TIME COMMAND                           later: `at 5s unit 19 input 1 ohms 107.8`
+";
+
+/// Reads a whole script; errors begin with the line's number, and all come at once.
+pub fn parse_script(text: &str) -> Result<Vec<Step>, Vec<String>> {
+    let (mut steps, mut errors) = (Vec::new(), Vec::new());
+    for (number, line) in text.lines().enumerate() {
+        match parse_line(line) {
+            Ok(step) => steps.extend(step),
+            Err(error) => errors.push(format!("line {}: {error}", number + 1)),
+        }
+    }
+    // Steps of the same time stay in the order of their lines.
+    steps.sort_by_key(|step: &Step| step.after);
+    if errors.is_empty() { Ok(steps) } else { Err(errors) }
+}
+
+/// Reads one line; `None` where it is empty or a comment.
+pub fn parse_line(line: &str) -> Result<Option<Step>, String> {
+    let line = line.split('#').next().unwrap_or("").trim();
+    let mut words: Vec<&str> = line.split_whitespace().collect();
+    if words.is_empty() {
+        return Ok(None);
+    }
+    let mut after = Duration::ZERO;
+    if words[0] == "at" {
+        let time = words.get(1).ok_or("`at` needs a time: `at 5s unit 18 restart`")?;
+        after = parse_duration(time)?;
+        words.drain(..2);
+    }
+    let ["unit", unit, command @ ..] = &words[..] else {
+        return Err(format!("`{line}` is not a command; one begins with `unit 18` or `at 5s unit 18`"));
+    };
+    let unit = match unit.parse() {
+        Ok(unit @ 1..=247) => unit,
+        _ => return Err(format!("`{unit}` is not a unit; a unit is 1 to 247")),
+    };
+    Ok(Some(Step { after, action: parse_action(unit, command)? }))
+}
+
+fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
+    let stimulus = match command {
+        ["restart"] => return Ok(Action::Restart { unit }),
+        ["power", "off"] => return Ok(Action::Power { unit, on: false }),
+        ["power", "on"] => return Ok(Action::Power { unit, on: true }),
+        ["fault", "none"] => return Ok(Action::Repair { unit }),
+        ["fault", kind] => {
+            let fault: Fault = kind.parse()?;
+            return Ok(Action::Fault(Fault { unit: Some(unit), ..fault }));
+        }
+        ["button"] => Stimulus::Button,
+        ["relay", relay, "hand", position] => {
+            let position = match *position {
+                "automatic" => Hand::Automatic,
+                "on" => Hand::On,
+                "off" => Hand::Off,
+                other => {
+                    return Err(format!(
+                        "`{other}` is not a position of a hand switch; there are `on`, `off`, `automatic`"
+                    ));
+                }
+            };
+            Stimulus::Hand { relay: parse_number("relay", relay)?, position }
+        }
+        ["input", input, signal @ ..] => {
+            Stimulus::Input { input: parse_number("input", input)?, signal: parse_signal(signal)? }
+        }
+        _ => return Err(format!("`{}` is not a command; there are\n{COMMANDS}", command.join(" "))),
+    };
+    Ok(Action::Stimulate { unit, stimulus })
+}
+
+fn parse_signal(words: &[&str]) -> Result<Signal, String> {
+    let finite = |text: &str| match text.parse::<f64>() {
+        Ok(number) if number.is_finite() => Ok(number),
+        _ => Err(format!("`{text}` is not a number")),
+    };
+    match words {
+        ["open"] | ["contact", "open"] if words.len() == 1 => Ok(Signal::Open),
+        ["contact", "open"] => Ok(Signal::Contact(false)),
+        ["contact", "closed"] => Ok(Signal::Contact(true)),
+        ["ohms", number] => Ok(Signal::Ohms(finite(number)?)),
+        ["volts", number] => Ok(Signal::Volts(finite(number)?)),
+        ["celsius", number] => Ok(Signal::Celsius(finite(number)?)),
+        ["counter", number] => Ok(Signal::Counter(parse_number("count", number)?)),
+        ["pulses", number] => {
+            Ok(Signal::Pulses { count: parse_number("count", number)?, every: Duration::from_millis(80) })
+        }
+        ["pulses", number, "every", period] => {
+            Ok(Signal::Pulses { count: parse_number("count", number)?, every: parse_duration(period)? })
+        }
+        _ => Err(format!("`{}` is not a signal; there are\n{COMMANDS}", words.join(" "))),
+    }
+}
+
+fn parse_number<T: std::str::FromStr>(what: &str, text: &str) -> Result<T, String> {
+    text.parse().map_err(|_| format!("`{text}` is not a {what}; write a whole number"))
+}
+
+/// Reads `80ms`, `5s`, `2m`, `1.5s`.
+pub fn parse_duration(text: &str) -> Result<Duration, String> {
+    let wrong = || format!("`{text}` is not a duration; write it as `80ms`, `5s` or `2m`");
+    let unit_at =
+        text.find(|letter: char| letter.is_ascii_alphabetic() || letter == 'µ').ok_or_else(wrong)?;
+    let number: f64 = text[..unit_at].parse().map_err(|_| wrong())?;
+    let seconds = match &text[unit_at..] {
+        "us" | "µs" => 1e-6,
+        "ms" => 1e-3,
+        "s" => 1.0,
+        "m" => 60.0,
+        "h" => 3600.0,
+        _ => return Err(wrong()),
+    };
+    // A hundred days; longer is surely a mistake, and this keeps every sum in range.
+    let amount = number * seconds;
+    if !(0.0..=8_640_000.0).contains(&amount) {
+        return Err(wrong());
+    }
+    Ok(Duration::from_micros((amount * 1e6).round() as u64))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_commands_of_the_help_are_understood() {
+        let stimulate = |unit, stimulus| Action::Stimulate { unit, stimulus };
+        let input = |signal| stimulate(19, Stimulus::Input { input: 1, signal });
+        for (line, after, action) in [
+            ("at 5s unit 19 input 1 ohms 107.8", 5000, input(Signal::Ohms(107.8))),
+            ("unit 19 input 1 volts 2.5 # a comment", 0, input(Signal::Volts(2.5))),
+            ("unit 19 input 1 celsius -12", 0, input(Signal::Celsius(-12.0))),
+            ("unit 19 input 1 open", 0, input(Signal::Open)),
+            ("unit 19 input 1 contact open", 0, input(Signal::Contact(false))),
+            ("unit 19 input 1 counter 281474976710655", 0, input(Signal::Counter(0xFFFF_FFFF_FFFF))),
+            (
+                "unit 19 input 1 pulses 100 every 60ms",
+                0,
+                input(Signal::Pulses { count: 100, every: Duration::from_millis(60) }),
+            ),
+            ("unit 20 button", 0, stimulate(20, Stimulus::Button)),
+            ("unit 18 relay 2 hand on", 0, stimulate(18, Stimulus::Hand { relay: 2, position: Hand::On })),
+            ("at 1.5s unit 18 power off", 1500, Action::Power { unit: 18, on: false }),
+            ("unit 18 restart", 0, Action::Restart { unit: 18 }),
+            (
+                "unit 18 fault late=700ms,every=2",
+                0,
+                Action::Fault("unit=18,late=700ms,every=2".parse().expect("a fault")),
+            ),
+            ("unit 18 fault none", 0, Action::Repair { unit: 18 }),
+        ] {
+            let step = Step { after: Duration::from_millis(after), action };
+            assert_eq!(parse_line(line), Ok(Some(step)), "{line}");
+        }
+        assert_eq!(parse_line("  # nothing"), Ok(None));
+    }
+
+    #[test]
+    fn all_wrong_lines_of_a_script_are_told_at_once_with_their_numbers() {
+        let told =
+            parse_script("unit 18 restart\nfoo\nat soon unit 18 restart\nunit 0 button\n").unwrap_err();
+        let beginnings =
+            ["line 2: `foo` is not a command", "line 3: `soon` is not a duration", "line 4: `0`"];
+        assert_eq!(told.len(), beginnings.len(), "{told:?}");
+        for (told, beginning) in told.iter().zip(beginnings) {
+            assert!(told.starts_with(beginning), "{told}");
+        }
+    }
+
+    #[test]
+    fn a_script_is_sorted_by_time_and_keeps_the_order_of_lines_within_one() {
+        let steps =
+            parse_script("at 2s unit 1 restart\nunit 2 restart\nat 2s unit 3 restart").expect("a script");
+        let units: Vec<&Action> = steps.iter().map(|step| &step.action).collect();
+        assert_eq!(
+            units,
+            [&Action::Restart { unit: 2 }, &Action::Restart { unit: 1 }, &Action::Restart { unit: 3 }]
+        );
+    }
+}
