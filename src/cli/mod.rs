@@ -24,7 +24,6 @@ macro_rules! verbs {
             $($Variant($module::Args),)*
         }
 
-        #[allow(unreachable_code, reason = "until the first verb is there")]
         /// Parses the arguments and runs the verb. A wrong argument ends the process with exit code 2.
         pub fn run() -> Result<(), Failure> {
             match CommandLine::parse().verb {

@@ -1,1 +1,443 @@
+//! A configuration file to [`Settings`], or to every fault in it.
+//!
+//! [`file`] is the shape, `words` its scalars; here and in `wishes` are the rules beyond the shape.
 
+pub mod file;
+mod wishes;
+mod words;
+
+use std::path::PathBuf;
+
+use crate::engine::configuration::file::Configuration;
+use crate::engine::configuration::words::{HostPort, Listen, Name, Part, Unit};
+use crate::engine::device::Device;
+use crate::engine::profile::file::Intervals;
+use crate::engine::profile::{self, Library};
+use crate::engine::settings::{
+    Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password, Settings,
+};
+use crate::engine::time::Duration;
+use crate::engine::yaml::{
+    At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, parse, read,
+    schema_of,
+};
+
+/// Something that works and may still be a mistake.
+pub type Warning = Diagnostic;
+
+/// The settings in `bytes`, a file that messages call `file_name`.
+pub fn load(
+    file_name: &str,
+    bytes: &[u8],
+    library: &Library,
+) -> Result<(Settings, Vec<Warning>), Vec<Diagnostic>> {
+    let mut faults = Faults::default();
+    let file: Option<Configuration> = Source::from_bytes(file_name, bytes, &mut faults)
+        .and_then(|source| parse(&source, &mut faults))
+        .and_then(|node| read(&node, &mut faults));
+    let mut resolver = Resolver { library, faults, warnings: Faults::default() };
+    let settings = file.and_then(|file| resolver.settings(&file));
+    let warnings = resolver.warnings.into_sorted();
+    resolver.faults.into_result(settings).map(|settings| (settings, warnings))
+}
+
+/// The folders under `profiles`, which must be read before [`load`]. Faults are left to [`load`].
+pub fn profile_folders(bytes: &[u8]) -> Vec<PathBuf> {
+    let mut faults = Faults::default();
+    let node = Source::from_bytes("", bytes, &mut faults).and_then(|source| parse(&source, &mut faults));
+    let folders = node.as_ref().and_then(|node| node.get("profiles"));
+    let folders: Option<Vec<String>> = folders.and_then(|folders| read(folders, &mut faults));
+    folders.unwrap_or_default().into_iter().map(PathBuf::from).collect()
+}
+
+/// The JSON Schema of a configuration file.
+pub fn schema() -> Json {
+    schema_of::<Configuration>("busker configuration")
+}
+
+struct Resolver<'a> {
+    library: &'a Library,
+    faults: Faults,
+    warnings: Faults,
+}
+
+impl Resolver<'_> {
+    /// Goes through the whole file. What is faulty becomes a fault and something harmless, so that
+    /// the rest is looked at as well.
+    fn settings(&mut self, file: &Configuration) -> Option<Settings> {
+        if let Some(state_dir) = file.state_dir.get().filter(|path| !path.starts_with('/')) {
+            let found = &state_dir.value;
+            self.faults.add(
+                &state_dir.place,
+                format!("`{found}` is no absolute path; expected one like `/var/lib/busker`"),
+            );
+        }
+        self.within(file.republish.get(), Duration::from_secs(1), Duration::from_secs(86_400));
+        let mqtt = section(&file.mqtt).map(|mqtt| self.mqtt(&mqtt));
+        let buses = self.buses(file);
+        let devices = self.devices(file);
+        // Each `?` stands for a fault that has been noted.
+        Some(Settings {
+            mqtt: mqtt?,
+            home_assistant: home_assistant(&section(&file.home_assistant)?),
+            http: http(&section(&file.http)?),
+            state_dir: PathBuf::from(&file.state_dir.get()?.value),
+            republish: file.republish.get()?.value,
+            on_broker_loss: *file.on_broker_loss.get()?,
+            buses,
+            devices,
+        })
+    }
+
+    fn mqtt(&mut self, file: &file::Mqtt) -> Mqtt {
+        if let (Some(password), Some(password_file)) = (&file.password, &file.password_file) {
+            let line = password.place.line();
+            self.faults.add(
+                &password_file.place,
+                format!("`password` stands in line {line} too; keep one of the two"),
+            );
+        }
+        let secret = file.password.as_ref().or(file.password_file.as_ref());
+        if let (Some(secret), None) = (secret, &file.username) {
+            self.faults.add(&secret.place, "a password without `username`; a broker wants both or neither");
+        }
+        Mqtt {
+            host: file.url.host.clone(),
+            port: file.url.port,
+            tls: false,
+            username: file.username.as_ref().map(|username| username.value.clone()),
+            password: match (&file.password, &file.password_file) {
+                (Some(password), _) => Password::Given(password.value.clone()),
+                (None, Some(path)) => Password::File(PathBuf::from(&path.value)),
+                (None, None) => Password::None,
+            },
+            base_topic: file.base_topic.0.clone(),
+        }
+    }
+
+    fn buses(&mut self, file: &Configuration) -> Vec<Bus> {
+        let mut buses = Vec::new();
+        let mut ports: Vec<&At<String>> = Vec::new();
+        let devices = file.devices.get();
+        for (name, bus) in file.buses.get().into_iter().flat_map(Map::iter) {
+            self.within(bus.response_timeout.get(), Duration::from_millis(10), Duration::from_secs(60));
+            self.within(read_part(&bus.gap), Duration::from_micros(100), Duration::from_secs(1));
+            if let Some(port) = read_part(&bus.serial) {
+                self.serial_port(port, &ports);
+                ports.push(port);
+            }
+            let is_here = |device: &file::Device| device.bus.get().is_none_or(|bus| bus.value == name.value);
+            if let Some(devices) = devices.filter(|devices| devices.unread.is_empty() && !devices.is_empty())
+            {
+                if !devices.iter().any(|(_, device)| is_here(device)) {
+                    self.warnings.add(&name.place, format!("no device is on the bus `{}`", name.0));
+                }
+            }
+            if let Some(link) = self.link(name, bus) {
+                buses.push(Bus {
+                    name: name.0.clone(),
+                    link,
+                    response_timeout: bus.response_timeout.get().map(|at| at.value).unwrap_or_default(),
+                    gap: read_part(&bus.gap).map(|gap| gap.value),
+                });
+            }
+        }
+        if devices.is_some_and(|devices| devices.is_empty() && devices.unread.is_empty()) {
+            self.warnings.add(&file.place, "no device is configured; devices stand under `devices`");
+        }
+        buses
+    }
+
+    fn serial_port(&mut self, port: &At<String>, others: &[&At<String>]) {
+        let path = port.as_str();
+        if !path.starts_with('/') {
+            self.faults.add(
+                &port.place,
+                format!("`{path}` is no path of a serial port; expected one like `/dev/serial/by-id/usb-…`"),
+            );
+        } else if path.starts_with("/dev/ttyUSB") || path.starts_with("/dev/ttyACM") {
+            self.warnings.add(
+                &port.place,
+                format!(
+                    "`{path}` may be another adapter after the next start; \
+                     use its path under `/dev/serial/by-id/`"
+                ),
+            );
+        }
+        if let Some(other) = others.iter().find(|other| other.value == port.value) {
+            let line = other.place.line();
+            self.faults.add(
+                &port.place,
+                format!("`{path}` is the port of the bus in line {line} already; a port serves one bus"),
+            );
+        }
+    }
+
+    fn link(&mut self, name: &At<Name>, bus: &file::Bus) -> Option<Link> {
+        let links = [
+            ("serial", bus.serial.as_ref().map(|link| link.get().map(|at| &at.place))),
+            ("tcp", bus.tcp.as_ref().map(|link| link.get().map(|at| &at.place))),
+            ("rtu_over_tcp", bus.rtu_over_tcp.as_ref().map(|link| link.get().map(|at| &at.place))),
+        ];
+        let mut given = links.into_iter().filter_map(|(key, link)| Some((key, link?)));
+        match given.next() {
+            None => self.faults.add(
+                &name.place,
+                format!(
+                    "the bus `{}` leads nowhere; expected one of `serial`, `tcp` or `rtu_over_tcp`",
+                    name.0
+                ),
+            ),
+            Some((first, _)) => {
+                for (other, place) in given {
+                    self.faults.add(
+                        place.unwrap_or(&name.place),
+                        format!("`{other}` stands beside `{first}`; a bus has one link, keep one of them"),
+                    );
+                }
+            }
+        }
+        let line = Line {
+            baud: read_part(&bus.baud).map_or(19_200, |baud| baud.0),
+            parity: read_part(&bus.parity).map_or(Parity::Even, |parity| parity.value),
+            stop_bits: read_part(&bus.stop_bits).map_or(1, |stop_bits| stop_bits.0),
+        };
+        match (&bus.serial, &bus.tcp, &bus.rtu_over_tcp) {
+            (Some(path), None, None) => Some(Link::Serial { path: path.get()?.value.clone(), line }),
+            (None, Some(address), None) => {
+                self.no_line(bus);
+                let HostPort { host, port } = self.address(address.get()?);
+                Some(Link::Tcp { host, port })
+            }
+            (None, None, Some(address)) => {
+                let HostPort { host, port } = self.address(address.get()?);
+                Some(Link::RtuOverTcp { host, port, line })
+            }
+            _ => None,
+        }
+    }
+
+    /// Notes the keys of a serial line on a bus that has none.
+    fn no_line(&mut self, bus: &file::Bus) {
+        let keys = [
+            ("baud", read_part(&bus.baud).map(|baud| &baud.place)),
+            ("parity", read_part(&bus.parity).map(|parity| &parity.place)),
+            ("stop_bits", read_part(&bus.stop_bits).map(|stop_bits| &stop_bits.place)),
+        ];
+        for (key, place) in keys {
+            if let Some(place) = place {
+                self.faults.add(
+                    place,
+                    format!(
+                        "Modbus TCP has no `{key}`; remove it, or write `rtu_over_tcp` \
+                         if a serial server passes the frames of a line through"
+                    ),
+                );
+            }
+        }
+    }
+
+    fn address(&mut self, address: &At<HostPort>) -> HostPort {
+        if address.port == 0 {
+            self.faults.add(&address.place, "nothing listens on port 0; Modbus TCP is usually on 502");
+        }
+        address.value.clone()
+    }
+
+    fn devices(&mut self, file: &Configuration) -> Vec<DeviceSettings> {
+        let mut devices = Vec::new();
+        let mut taken: Vec<(&Name, Unit, &At<Name>)> = Vec::new();
+        for (name, device) in file.devices.get().into_iter().flat_map(Map::iter) {
+            self.device_name(name, file);
+            if let (Some(bus), Some(unit)) = (device.bus.get(), device.unit.get()) {
+                let same =
+                    taken.iter().find(|(other, taken, _)| **other == bus.value && *taken == unit.value);
+                if let Some((_, _, other)) = same {
+                    self.faults.add(
+                        &unit.place,
+                        format!(
+                            "unit {} on the bus `{}` is the device `{}` of line {} already; \
+                             two devices on a bus need two units",
+                            unit.value.0,
+                            bus.value.0,
+                            other.value.0,
+                            other.place.line()
+                        ),
+                    );
+                }
+                taken.push((&bus.value, unit.value, name));
+            }
+            let bus = self.bus_of(device, file);
+            if let (Some(bus), Some(unit), Some(resolved)) = (bus, device.unit.get(), self.device(device)) {
+                devices.push(DeviceSettings {
+                    name: name.0.clone(),
+                    title: device.name.clone().unwrap_or_else(|| title(&name.0)),
+                    bus,
+                    unit: unit.value.0,
+                    device: resolved,
+                });
+            }
+        }
+        devices
+    }
+
+    fn device_name(&mut self, name: &At<Name>, file: &Configuration) {
+        if name.0 == "bridge" {
+            self.faults.add(&name.place, "`bridge` is the gateway's own name; give the device another one");
+        }
+        let of_a_bus = name.0.strip_prefix("bus_").map(|bus| Name(bus.into()));
+        if let Some(bus) = of_a_bus.filter(|bus| file.buses.get().is_some_and(|buses| buses.names(bus))) {
+            self.faults.add(
+                &name.place,
+                format!(
+                    "`{}` is how Home Assistant knows the bus `{}`; give the device another name",
+                    name.0, bus.0
+                ),
+            );
+        }
+    }
+
+    /// The index of a device's bus; the device's unit is checked against it.
+    fn bus_of(&mut self, device: &file::Device, file: &Configuration) -> Option<usize> {
+        let (wanted, buses) = (device.bus.get()?, file.buses.get()?);
+        if !buses.names(&wanted.value) {
+            let names: Vec<&str> = buses.iter().map(|(name, _)| name.0.as_str()).collect();
+            self.faults.add(
+                &wanted.place,
+                format!("there is no bus `{}`; {}", wanted.0, list_of_choices(&wanted.0, &names)),
+            );
+            return None;
+        }
+        let index = buses.iter().position(|(name, _)| name.value == wanted.value)?;
+        let unit = device.unit.get()?;
+        if buses.entries[index].1.tcp.is_none() && !(1..=247).contains(&unit.value.0) {
+            let why =
+                if unit.value.0 == 0 { "0 speaks to all units at once" } else { "248 to 255 are reserved" };
+            self.faults.add(
+                &unit.place,
+                format!("{} is no unit on a serial line ({why}); expected 1 to 247", unit.value.0),
+            );
+        }
+        Some(index)
+    }
+
+    /// The profile with the owner's wishes, or the device's own points.
+    fn device(&mut self, file: &file::Device) -> Option<Device> {
+        let mut device = match &file.profile {
+            Some(profile) => {
+                for (key, node) in [("wire", &file.wire), ("home_assistant", &file.home_assistant)] {
+                    if let Some(node) = node {
+                        self.faults.add(
+                            node.named_at(),
+                            format!(
+                                "`{key}` belongs to the profile; it stands here only for a device without one"
+                            ),
+                        );
+                    }
+                }
+                self.profile(profile)?
+            }
+            None => self.inline(file)?,
+        };
+        if let Some(poll) = read_part(&file.poll) {
+            self.intervals(poll, &mut device);
+        }
+        if let (Some(_), Some(points)) = (&file.profile, &file.points) {
+            wishes::apply(points, &mut device, &mut self.faults, &mut self.warnings);
+        }
+        Some(device)
+    }
+
+    fn profile(&mut self, wanted: &At<String>) -> Option<Device> {
+        if !self.library.contains(wanted) {
+            let choices = list_of_choices(wanted, &self.library.ids());
+            self.faults.add(&wanted.place, format!("unknown profile `{}`; {choices}", wanted.value));
+            return None;
+        }
+        self.library.load(wanted).map_err(|faults| self.faults.extend(faults)).ok()
+    }
+
+    fn inline(&mut self, file: &file::Device) -> Option<Device> {
+        let Some(points) = &file.points else {
+            self.faults.add(&file.place, "this device has neither a `profile` nor `points` of its own");
+            return None;
+        };
+        let (wire, home_assistant) = (file.wire.as_ref(), file.home_assistant.as_ref());
+        profile::load_inline(points, wire, home_assistant, self.library, &mut self.faults)
+    }
+
+    fn intervals(&mut self, file: &Intervals, device: &mut Device) {
+        let intervals = &mut device.wire.intervals;
+        for (wish, own) in [(&file.fast, &mut intervals.fast), (&file.slow, &mut intervals.slow)] {
+            self.within(wish.as_ref(), Duration::from_millis(10), Duration::from_secs(86_400));
+            if let Some(wish) = wish {
+                *own = wish.value;
+            }
+        }
+        if intervals.fast > intervals.slow {
+            let (fast, slow) = (told(intervals.fast), told(intervals.slow));
+            self.faults.add(&file.place, format!("`fast` ({fast}) takes longer than `slow` ({slow})"));
+        }
+    }
+
+    fn within(&mut self, found: Option<&At<Duration>>, least: Duration, most: Duration) {
+        if let Some(found) = found.filter(|found| !(least..=most).contains(&found.value)) {
+            let (value, least, most) = (told(found.value), told(least), told(most));
+            self.faults.add(&found.place, format!("{value} is out of range; expected {least} to {most}"));
+        }
+    }
+}
+
+fn read_part<T>(part: &Option<Part<T>>) -> Option<&T> {
+    part.as_ref().and_then(Part::get)
+}
+
+fn home_assistant(file: &file::HomeAssistant) -> HomeAssistant {
+    HomeAssistant {
+        discovery: file.discovery,
+        prefix: file.prefix.0.clone(),
+        status_topic: file.status_topic.0.clone(),
+    }
+}
+
+fn http(file: &file::Http) -> Http {
+    let listen = file.listen.as_ref().map(|Listen(listen)| match listen.host.contains(':') {
+        true => format!("[{}]:{}", listen.host, listen.port),
+        false => format!("{}:{}", listen.host, listen.port),
+    });
+    Http { listen }
+}
+
+/// A section that was left out is one in which every key was left out; `None` for a faulty one.
+fn section<T: Read + Clone>(file: &Option<Part<T>>) -> Option<T> {
+    match file {
+        Some(part) => part.get().cloned(),
+        None => {
+            let empty = Node { place: Place::nowhere(), key: None, content: Content::Map(Vec::new()) };
+            read(&empty, &mut Faults::default())
+        }
+    }
+}
+
+/// `heating_relays` → `Heating relays`.
+fn title(name: &str) -> String {
+    let mut letters = name.chars();
+    let first = letters.next().map(|first| first.to_ascii_uppercase());
+    first.into_iter().chain(letters).map(|c| if c == '_' { ' ' } else { c }).collect()
+}
+
+/// A duration as people write it here: `250ms`, `1.5s`, `10m`.
+fn told(duration: Duration) -> String {
+    let micros = duration.as_micros();
+    for (unit, each) in
+        [("d", 86_400_000_000), ("h", 3_600_000_000), ("m", 60_000_000), ("s", 1_000_000), ("ms", 1000)]
+    {
+        if micros >= each && micros % each == 0 {
+            return format!("{}{unit}", micros / each);
+        }
+    }
+    if micros >= 1000 { format!("{}ms", micros as f64 / 1000.0) } else { format!("{micros}us") }
+}
+
+#[cfg(test)]
+mod tests;

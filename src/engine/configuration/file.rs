@@ -1,0 +1,133 @@
+//! Exactly what a configuration file may say. What is true is in `settings`.
+//!
+//! A [`Part`] that cannot be read does not keep the rest from being checked.
+
+use crate::engine::configuration::words::{
+    BaudRate, BrokerUrl, HostPort, Listen, Name, NoTls, Part, StopBits, Topic, Unit,
+};
+use crate::engine::device::Poll;
+use crate::engine::profile::file::{Intervals, Presentation};
+use crate::engine::settings::{OnBrokerLoss, Parity};
+use crate::engine::time::Duration;
+use crate::engine::value::Decimal;
+use crate::engine::yaml::{At, Map, Node, record};
+
+record! {
+    /// The configuration of one gateway.
+    pub struct Configuration {
+        /// The broker.
+        mqtt: Option<Part<Mqtt>>,
+        /// How devices are announced to Home Assistant.
+        home_assistant: Option<Part<HomeAssistant>>,
+        /// The HTTP interface, which only tells.
+        http: Option<Part<Http>>,
+        /// The folder in which the gateway remembers things between runs.
+        state_dir: Part<At<String>> = Part::of(At::nowhere("/var/lib/busker".into())),
+        /// An unchanged value is told again after this time.
+        republish: Part<At<Duration>> = Part::of(At::nowhere(Duration::from_secs(600))),
+        /// What happens while the broker cannot be reached: `keep` polls on, so that the watchdogs of
+        /// devices stay fed; `stop_feeding` leaves devices with a watchdog alone, so that their outputs
+        /// fall to the safe state.
+        on_broker_loss: Part<OnBrokerLoss> = Part::of(OnBrokerLoss::Keep),
+        /// Folders with profiles beside the shipped ones; a profile there wins.
+        profiles: Part<Vec<At<String>>> = Part::of(Vec::new()),
+        /// Serial lines and TCP connections, by name.
+        buses: Part<Map<Name, Bus>>,
+        /// Devices by name; topics and identifiers are made of it.
+        devices: Part<Map<Name, Device>> = Part::of(Map::default()),
+    }
+}
+
+record! {
+    /// The broker.
+    pub struct Mqtt {
+        /// Where it listens.
+        url: At<BrokerUrl> = At::nowhere(BrokerUrl { host: "localhost".into(), port: 1883 }),
+        username: Option<At<String>>,
+        /// Better kept in a file of its own, see `password_file`.
+        password: Option<At<String>>,
+        /// A file whose first line is the password.
+        password_file: Option<At<String>>,
+        /// The first level of all topics; one per gateway where several share a broker.
+        base_topic: At<Topic> = At::nowhere(Topic("busker".into())),
+        /// Not in this version.
+        tls: Option<NoTls>,
+    }
+}
+
+record! {
+    /// How devices are announced to Home Assistant.
+    pub struct HomeAssistant {
+        /// Whether they are announced at all.
+        discovery: bool = true,
+        /// Home Assistant's discovery prefix.
+        prefix: At<Topic> = At::nowhere(Topic("homeassistant".into())),
+        /// Where Home Assistant says that it has started.
+        status_topic: At<Topic> = At::nowhere(Topic("homeassistant/status".into())),
+    }
+}
+
+record! {
+    /// The HTTP interface, which only tells.
+    pub struct Http {
+        /// `host:port`; port 0 takes a free one, `null` turns HTTP off.
+        listen: Option<Listen> = Some(Listen(HostPort { host: "127.0.0.1".into(), port: 8485 })),
+    }
+}
+
+record! {
+    /// One serial line or TCP connection: exactly one of `serial`, `tcp` and `rtu_over_tcp`.
+    pub struct Bus {
+        /// The path of a serial port that speaks Modbus RTU.
+        serial: Option<Part<At<String>>>,
+        /// `host:port` of a device or gateway that speaks Modbus TCP.
+        tcp: Option<Part<At<HostPort>>>,
+        /// `host:port` of a serial server that passes RTU frames through.
+        rtu_over_tcp: Option<Part<At<HostPort>>>,
+        /// Bits a second on the serial line; 19200 unless said.
+        baud: Option<Part<At<BaudRate>>>,
+        /// The parity on the serial line; even unless said.
+        parity: Option<Part<At<Parity>>>,
+        /// 1 unless said.
+        stop_bits: Option<Part<At<StopBits>>>,
+        /// How long a reply may take before the request counts as unanswered.
+        response_timeout: Part<At<Duration>> = Part::of(At::nowhere(Duration::from_millis(500))),
+        /// Silence before each request; 3.5 characters unless said.
+        gap: Option<Part<At<Duration>>>,
+    }
+}
+
+record! {
+    /// One device on one bus, with a profile or with points of its own.
+    pub struct Device {
+        /// The identifier of a profile, as `busker profiles list` tells them.
+        profile: Option<At<String>>,
+        /// The name of its bus.
+        bus: Part<At<Name>>,
+        /// Its address on the bus: 1 to 247, on Modbus TCP 0 to 255.
+        unit: Part<At<Unit>>,
+        /// What people call it.
+        name: Option<String>,
+        /// With a profile: wishes for its points, by their names. Without: the points themselves, in the
+        /// form of a profile.
+        points: Option<Node>,
+        /// Without a profile: how the device behaves on the wire, in the form of a profile.
+        wire: Option<Node>,
+        /// Without a profile: how the points look, in the form of a profile.
+        home_assistant: Option<Node>,
+        /// The periods of the poll classes.
+        poll: Option<Part<Intervals>>,
+    }
+}
+
+record! {
+    /// Wishes for one point of a profile.
+    pub struct PointWish {
+        /// The unit of a number of which the profile does not know it.
+        unit: Option<At<String>>,
+        /// A reading that differs less than this from the last one told is not told.
+        deadband: Option<At<Decimal>>,
+        /// When it is read.
+        poll: Option<At<Poll>>,
+    } and presentation: Presentation
+}

@@ -1,0 +1,289 @@
+//! The words of a configuration file: names, addresses, topics, and what else is one scalar.
+
+use serde_json::json;
+
+use crate::engine::settings::{OnBrokerLoss, Parity};
+use crate::engine::yaml::{Definitions, Faults, Json, Node, Read, Scalar, choices};
+
+choices! { "a parity", Parity { "none" => Parity::None, "even" => Parity::Even, "odd" => Parity::Odd } }
+
+choices! { "a rule for a lost broker", OnBrokerLoss {
+    "keep" => OnBrokerLoss::Keep,
+    "stop_feeding" => OnBrokerLoss::StopFeeding,
+} }
+
+/// The name of a device, a bus or a point.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Name(pub String);
+
+impl Scalar for Name {
+    const EXPECTED: &'static str = "a name like `heating_relays`";
+
+    fn parse(text: &str) -> Result<Name, String> {
+        let good = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        if text.starts_with(|c: char| c.is_ascii_lowercase()) && text.chars().all(good) {
+            return Ok(Name(text.into()));
+        }
+        let right = match suggestion(text) {
+            Some(suggestion) => format!("perhaps `{suggestion}`"),
+            None => "as in `heating_relays`".into(),
+        };
+        Err(format!(
+            "`{text}` cannot be a name; names are small letters, digits and `_`, and begin with a letter, {right}"
+        ))
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": "^[a-z][a-z0-9_]*$"})
+    }
+}
+
+/// `Heating-Relays 2` → `heating_relays_2`; `None` if little would be left.
+fn suggestion(text: &str) -> Option<String> {
+    let plain: String = text
+        .chars()
+        .flat_map(char::to_lowercase)
+        .map(|c| if c.is_ascii_alphanumeric() { c } else { '_' })
+        .collect();
+    let plain = plain.trim_matches('_');
+    plain.starts_with(|c: char| c.is_ascii_lowercase()).then(|| plain.to_string())
+}
+
+/// The address of a device on its bus, before it is known whether that is a serial line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Unit(pub u8);
+
+impl Scalar for Unit {
+    const EXPECTED: &'static str = "a unit, 1 to 247";
+
+    fn parse(text: &str) -> Result<Unit, String> {
+        match i128::parse(text)? {
+            unit @ 0..=255 => Ok(Unit(unit as u8)),
+            unit => Err(format!("{unit} is no unit; expected 1 to 247 (on Modbus TCP 0 to 255)")),
+        }
+    }
+
+    fn schema() -> Json {
+        json!({"type": "integer", "minimum": 0, "maximum": 255})
+    }
+}
+
+/// Bits a second on a serial line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BaudRate(pub u32);
+
+/// What serial adapters and devices offer. A rate beside them is rather a slip of the fingers.
+const BAUD_RATES: [u32; 19] = [
+    300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 57600, 76800, 115_200, 125_000, 187_500,
+    230_400, 250_000, 460_800, 921_600,
+];
+
+impl Scalar for BaudRate {
+    const EXPECTED: &'static str = "a baud rate like 9600 or 19200";
+
+    fn parse(text: &str) -> Result<BaudRate, String> {
+        let found = i128::parse(text)?;
+        if let Some(rate) = BAUD_RATES.into_iter().find(|rate| i128::from(*rate) == found) {
+            return Ok(BaudRate(rate));
+        }
+        let nearest = BAUD_RATES.into_iter().min_by_key(|rate| i128::from(*rate).abs_diff(found));
+        let nearest = nearest.unwrap_or_default();
+        Err(format!("{found} is no usual baud rate; the nearest is {nearest}"))
+    }
+
+    fn schema() -> Json {
+        json!({"enum": BAUD_RATES})
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StopBits(pub u8);
+
+impl Scalar for StopBits {
+    const EXPECTED: &'static str = "1 or 2";
+
+    fn parse(text: &str) -> Result<StopBits, String> {
+        match text {
+            "1" => Ok(StopBits(1)),
+            "2" => Ok(StopBits(2)),
+            _ => Err(format!("`{text}` is no number of stop bits; expected 1 or 2")),
+        }
+    }
+
+    fn schema() -> Json {
+        json!({"enum": [1, 2]})
+    }
+}
+
+/// `host:port`; an IPv6 address stands in brackets, and is kept without them.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HostPort {
+    pub host: String,
+    pub port: u16,
+}
+
+impl Scalar for HostPort {
+    const EXPECTED: &'static str = "an address like `192.168.1.20:502`";
+
+    fn parse(text: &str) -> Result<HostPort, String> {
+        let example = "as in `192.168.1.20:502`";
+        let Some((host, port)) = text.rsplit_once(':') else {
+            return Err(format!("`{text}` has no port; expected host and port, {example}"));
+        };
+        let port = parse_port(port)?;
+        match parse_host(host) {
+            Some(host) => Ok(HostPort { host, port }),
+            None => Err(format!("`{host}` is no host; expected host and port, {example}")),
+        }
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": "^(\\[[0-9A-Fa-f:.]+\\]|[A-Za-z0-9._-]+):[0-9]+$"})
+    }
+}
+
+/// Where HTTP listens.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Listen(pub HostPort);
+
+impl Scalar for Listen {
+    const EXPECTED: &'static str = "an address like `127.0.0.1:8485`";
+
+    fn parse(text: &str) -> Result<Listen, String> {
+        if ["off", "no", "false", "none"].contains(&text) {
+            return Err(format!("`{text}` is no address; to turn HTTP off, write `listen: null`"));
+        }
+        HostPort::parse(text).map(Listen)
+    }
+
+    fn schema() -> Json {
+        <HostPort as Scalar>::schema()
+    }
+}
+
+fn parse_port(text: &str) -> Result<u16, String> {
+    let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let port = if digits { text.parse().ok() } else { None };
+    port.ok_or_else(|| format!("`{text}` is no port; expected a number up to 65535"))
+}
+
+/// A name, an IPv4 address, or an IPv6 address in brackets, which are taken off.
+fn parse_host(text: &str) -> Option<String> {
+    if let Some(inside) = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')) {
+        let address = inside.split('%').next().unwrap_or_default();
+        return address.parse::<core::net::Ipv6Addr>().ok().map(|_| inside.to_string());
+    }
+    let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_');
+    (!text.is_empty() && text.chars().all(good)).then(|| text.to_string())
+}
+
+/// `mqtt://host:port`; the port is 1883 unless said.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BrokerUrl {
+    pub host: String,
+    pub port: u16,
+}
+
+impl Scalar for BrokerUrl {
+    const EXPECTED: &'static str = "a URL like `mqtt://localhost:1883`";
+
+    fn parse(text: &str) -> Result<BrokerUrl, String> {
+        let expected = Self::EXPECTED;
+        let address = match text.split_once("://") {
+            Some(("mqtt", address)) => address,
+            Some(("mqtts" | "ssl", _)) => {
+                return Err(format!(
+                    "`{text}` asks for TLS, which this version does not have; expected {expected}"
+                ));
+            }
+            Some((other, _)) => return Err(format!("`{other}` is no way to a broker; expected {expected}")),
+            None => return Err(format!("`{text}` is no URL; expected {expected}")),
+        };
+        let address = address.strip_suffix('/').unwrap_or(address);
+        // Never repeated in a message: there is a password in it.
+        if address.contains('@') {
+            return Err("a user stands in the URL; use the keys `username` and `password_file`".into());
+        }
+        let ends_in_host = address.ends_with(']') || !address.contains(':');
+        let (host, port) = match address.rsplit_once(':') {
+            Some((host, port)) if !ends_in_host => (host, parse_port(port)?),
+            _ => (address, 1883),
+        };
+        match parse_host(host) {
+            Some(_) if port == 0 => Err(format!("port 0 in `{text}`; expected {expected}")),
+            Some(host) => Ok(BrokerUrl { host, port }),
+            None => Err(format!("`{host}` is no host; expected {expected}")),
+        }
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": "^mqtt://[^@/]+/?$"})
+    }
+}
+
+/// A topic, or the beginning of topics.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Topic(pub String);
+
+impl Scalar for Topic {
+    const EXPECTED: &'static str = "a topic like `busker`";
+
+    fn parse(text: &str) -> Result<Topic, String> {
+        let why = if text.contains(['+', '#']) {
+            "`+` and `#` are wildcards"
+        } else if text.starts_with('$') {
+            "topics that begin with `$` belong to the broker"
+        } else if text.split('/').any(str::is_empty) {
+            "a level of it is empty"
+        } else if text.chars().any(|c| c.is_control() || c.is_whitespace()) {
+            "there is a space in it"
+        } else {
+            return Ok(Topic(text.into()));
+        };
+        Err(format!("`{text}` cannot be a topic: {why}; expected one like `busker` or `house/busker`"))
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": "^[^$+#/\\s][^+#/\\s]*(/[^+#/\\s]+)*$"})
+    }
+}
+
+/// The key `tls`, which says what this version cannot do.
+#[derive(Clone, Debug)]
+pub struct NoTls;
+
+impl Read for NoTls {
+    fn read(node: &Node, faults: &mut Faults) -> Option<NoTls> {
+        faults.add(node.named_at(), "this version does not have TLS; remove `tls` and use a `mqtt://` URL");
+        None
+    }
+
+    fn schema(_: &mut Definitions) -> Json {
+        json!(false)
+    }
+}
+
+/// Something that may be unreadable: its faults are noted, and the rest of the file goes on.
+#[derive(Clone, Debug)]
+pub struct Part<T>(Option<T>);
+
+impl<T> Part<T> {
+    pub fn of(value: T) -> Part<T> {
+        Part(Some(value))
+    }
+
+    /// What was read; `None` if that is known to be faulty.
+    pub fn get(&self) -> Option<&T> {
+        self.0.as_ref()
+    }
+}
+
+impl<T: Read> Read for Part<T> {
+    fn read(node: &Node, faults: &mut Faults) -> Option<Part<T>> {
+        Some(Part(T::read(node, faults)))
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        T::schema(definitions)
+    }
+}
