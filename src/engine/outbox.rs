@@ -5,7 +5,7 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use crate::engine::time::{Duration, Time};
-use crate::engine::topics::{Message, ONLINE, Topics};
+use crate::engine::topics::{Message, OFFLINE, ONLINE, Topics};
 
 /// Messages told once that may wait; more push out the oldest.
 const ONCE_MAX: usize = 256;
@@ -143,8 +143,14 @@ impl Outbox {
         }
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.queue.is_empty()
+    /// The program ends: `offline` goes out behind everything that waits.
+    pub fn goodbye(&mut self) {
+        let topic = self.topics.bridge_state();
+        self.queue.retain(|queued| !matches!(queued, Queued::Newest(waiting) if *waiting == topic));
+        if let Some(entry) = self.retained.get_mut(&topic) {
+            entry.queued = false;
+        }
+        self.push_retained(Message::retained(topic, OFFLINE));
     }
 
     /// Messages told once that were pushed out since the start.
@@ -348,6 +354,15 @@ mod tests {
         assert_eq!(outbox.next_message(), Some(Message::retained("busker/a/x", "1")));
         assert_eq!(outbox.next_message(), Some(Message::once("busker/a/x/outcome", "3")));
         assert_eq!(std::iter::from_fn(|| outbox.next_message()).count(), ONCE_MAX - 1);
+    }
+
+    #[test]
+    fn the_last_message_is_offline() {
+        let mut outbox = outbox();
+        outbox.connected();
+        retained(&mut outbox, "busker/a/availability", "offline");
+        outbox.goodbye();
+        check_sent(&mut outbox, &["busker/a/availability offline", "busker/bridge/state offline"]);
     }
 
     #[test]
