@@ -24,7 +24,7 @@ struct Planned {
     has_selector: bool,
     began_at: Option<Time>,
     wanted_now: bool,
-    /// Has ended, well or badly, since the device connected.
+    /// Has been answered since the device connected, if only with an exception.
     tried: bool,
     /// Answered with an exception: not asked again before.
     paused_until: Time,
@@ -83,16 +83,27 @@ impl Polls {
         self.reads.iter().filter_map(Planned::due_at).min()
     }
 
-    /// The read has been sent.
+    /// The read is being sent.
     pub fn begin(&mut self, index: usize, now: Time) {
         let planned = &mut self.reads[index];
-        planned.began_at = Some(now);
+        // A read that begins a little late does not shift those after it: the period is kept on average.
+        let on_time =
+            planned.began_at.zip(planned.period).map(|(began_at, period)| (began_at + period, period));
+        planned.began_at = match on_time {
+            Some((due, period)) if !planned.wanted_now && due <= now && now - due < period => Some(due),
+            _ => Some(now),
+        };
         planned.wanted_now = false;
     }
 
-    /// The read has ended, well or badly.
+    /// The read has been answered, if only with an exception.
     pub fn end(&mut self, index: usize) {
         self.reads[index].tried = true;
+    }
+
+    /// Nothing came of the read: it is wanted as before.
+    pub fn want_again(&mut self, index: usize) {
+        self.reads[index].wanted_now = true;
     }
 
     /// The read was refused by the device: ask again later than usual.
@@ -119,7 +130,7 @@ impl Polls {
         }
     }
 
-    /// Whether each read has been tried since the connect.
+    /// Whether each read has been answered since the connect.
     pub fn first_round_is_over(&self) -> bool {
         self.reads.iter().all(|planned| planned.tried)
     }

@@ -146,7 +146,10 @@ impl Values {
         let worth_telling = match &value.told {
             None => true,
             Some((told, told_at)) => {
-                anyway || now - *told_at >= republish || differs(told, &value.reading, details)
+                // What was told at this very moment need not be told twice.
+                (anyway && *told_at < now)
+                    || now - *told_at >= republish
+                    || differs(told, &value.reading, details)
             }
         };
         if !worth_telling {

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::command::{Outcome, OutcomeKind, words_of};
 use crate::engine::device::{Device, Identify, Point, PointIndex};
 use crate::engine::health::{Counters, DeviceReport, PointReport};
 use crate::engine::homeassistant::{self, Announcement};
@@ -45,7 +45,7 @@ pub(super) struct DeviceState {
     last_answer_at: Option<Time>,
     counters: Counters,
     identity: Option<String>,
-    told_available: bool,
+    told_available: Option<bool>,
     told_info: String,
     announced: Option<Announcement>,
     announcement_due: bool,
@@ -88,7 +88,7 @@ impl DeviceState {
             last_answer_at: None,
             counters: Counters::default(),
             identity: None,
-            told_available: false,
+            told_available: None,
             told_info: String::new(),
             announced: None,
             announcement_due: true,
@@ -167,7 +167,7 @@ impl DeviceState {
             title: self.settings.title.clone(),
             profile: self.settings.device.profile.clone(),
             unit: self.settings.unit,
-            online: self.told_available,
+            online: self.told_available == Some(true),
             reason: self.reason(),
             identity: self.identity.clone(),
             counters: self.counters,
@@ -311,7 +311,6 @@ impl DeviceState {
         self.presence = Presence::Present;
         self.paused_until = now;
         self.polls.want_all();
-        self.tell_info(context);
     }
 
     fn mistake(&mut self, now: Time, reason: String, context: &mut Context) {
@@ -359,21 +358,21 @@ impl DeviceState {
         result: Result<Answer, RequestError>,
         context: &mut Context,
     ) {
+        let answered = matches!(result, Ok(_) | Err(RequestError::Exception(_)));
+        if answered && self.presence != Presence::Present {
+            // A device without an identification is there when it answers a read.
+            self.arrive(now, context);
+            self.polls.begin(index, self.served_at);
+        }
         match result {
             Ok(answer) => {
-                if self.presence != Presence::Present {
-                    // A device without an identification is there when it answers a read.
-                    self.arrive(now, context);
-                }
                 self.polls.end(index);
                 let read = self.polls.read(index).clone();
-                self.absorb(now, &read, &crate::engine::command::words_of(&answer), context);
+                self.absorb(now, &read, &words_of(&answer), context);
             }
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
-                self.polls.end(index);
-                let read = self.polls.read(index).clone();
-                read.points.iter().for_each(|(point, _)| self.polls.want(*point));
+                self.polls.want_again(index);
                 self.failed(now, &error, context);
             }
         }
@@ -385,6 +384,7 @@ impl DeviceState {
         let read = self.polls.read(index).clone();
         let gaps = read.gaps();
         if matches!(code, 5 | 6) {
+            self.polls.want_again(index);
             self.polls.pause(index, now + PAUSE_BUSY);
             return;
         }
@@ -435,11 +435,9 @@ impl DeviceState {
             if self.announcement_due {
                 self.announce(context);
             }
-            if !self.told_available {
-                self.publish_availability(true, context);
-            }
+            self.publish_availability(true, context);
+            self.tell_info(context);
         }
-        self.tell_info(context);
     }
 
     // Commands.
@@ -520,7 +518,10 @@ impl DeviceState {
     }
 
     fn publish_availability(&mut self, available: bool, context: &mut Context) {
-        self.told_available = available;
+        if self.told_available == Some(available) {
+            return;
+        }
+        self.told_available = Some(available);
         let topic = context.gateway.topics.availability(&self.settings.name);
         context.publish(Message::retained(topic, if available { ONLINE } else { OFFLINE }));
     }

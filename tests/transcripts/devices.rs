@@ -1,0 +1,211 @@
+//! The gateway and the devices that transcripts speak of: a header line `device NAME UNIT KIND` each.
+
+use busker::engine::address::{Address, Bits, Span, Table};
+use busker::engine::device::{
+    Case, Decimals, Device, Encoding, Form, Identify, Intervals, Kind, Limits, Names, Point, Poll,
+    Presentation, Quirks, Unit, Wire, Write, WriteRule,
+};
+use busker::engine::settings::{
+    Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password, Settings,
+};
+use busker::engine::time::Duration;
+use busker::engine::value::Decimal;
+
+/// Reads the header: `device …` lines, and `discovery` or `stop feeding` by themselves.
+pub fn settings(header: &str) -> Settings {
+    let mut devices = Vec::new();
+    for line in header.lines() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        if let ["device", name, unit, kind] = words[..] {
+            devices.push(DeviceSettings {
+                name: name.into(),
+                title: name.into(),
+                bus: 0,
+                unit: unit.parse().expect("a unit"),
+                device: device(kind),
+            });
+        }
+    }
+    let says = |wanted: &str| header.lines().any(|line| line == wanted);
+    Settings {
+        mqtt: Mqtt {
+            host: "localhost".into(),
+            port: 1883,
+            tls: false,
+            username: None,
+            password: Password::None,
+            base_topic: "busker".into(),
+        },
+        home_assistant: HomeAssistant {
+            discovery: says("discovery"),
+            prefix: "homeassistant".into(),
+            status_topic: "homeassistant/status".into(),
+        },
+        http: Http { listen: None },
+        state_dir: "/nowhere".into(),
+        republish: Duration::from_secs(600),
+        on_broker_loss: if says("stop feeding") { OnBrokerLoss::StopFeeding } else { OnBrokerLoss::Keep },
+        buses: vec![Bus {
+            name: "basement".into(),
+            link: Link::Serial {
+                path: "/dev/null".into(),
+                line: Line { baud: 19200, parity: Parity::Even, stop_bits: 1 },
+            },
+            response_timeout: Duration::from_millis(500),
+            gap: None,
+        }],
+        devices,
+    }
+}
+
+fn device(kind: &str) -> Device {
+    match kind {
+        "thermometer" => with(vec![
+            formed(point("temperature", register(Table::Input, 0, 1), Poll::Fast), tenths("°C")),
+            point("strokes", register(Table::Input, 1, 2), Poll::Slow),
+        ]),
+        "holes" => with(vec![
+            point("first", register(Table::Input, 0, 1), Poll::Fast),
+            point("third", register(Table::Input, 2, 1), Poll::Fast),
+        ]),
+        "relays" => relays(),
+        "selectable" => selectable(),
+        "identified" => {
+            let mut device = with(vec![point("level", register(Table::Input, 0, 1), Poll::Fast), order()]);
+            device.identify = Some(Identify::Names { vendor: "ACME".into(), product: "L1".into() });
+            device
+        }
+        "clamping" => {
+            let mut device = with(vec![order(), master()]);
+            device.wire.quirks.clamps_with_exception = true;
+            device
+        }
+        other => panic!("no kind of device is called `{other}`"),
+    }
+}
+
+/// Four relays as coils, what they do after a reset as bits in EEPROM, a watchdog, a reset button.
+fn relays() -> Device {
+    let mut points: Vec<Point> = (0..2)
+        .map(|index| {
+            let at = register(Table::Coil, index, 1);
+            writable(flag(&format!("relay_{}", index + 1), at, Poll::Fast), WriteRule::Any)
+        })
+        .collect();
+    for bit in 0..2 {
+        let at = Address { span: Span::single(Table::Holding, 1), bits: Bits::new(bit, bit) };
+        let mut default =
+            writable(flag(&format!("relay_{}_default", bit + 1), at, Poll::Slow), WriteRule::Any);
+        default.persistent = true;
+        points.push(default);
+    }
+    let mut watchdog = point("watchdog", register(Table::Holding, 66, 1), Poll::Slow);
+    let mut seconds = Form::new(Kind::U16);
+    seconds.scale = Decimal { units: 1, decimals: 2 };
+    watchdog = writable(formed(watchdog, seconds), range("0", "655.35"));
+    watchdog.persistent = true;
+    points.push(watchdog);
+    let reset = point("reset", register(Table::Holding, 79, 1), Poll::Never);
+    points.push(writable(reset, WriteRule::Press { word: 10, self_clearing: false }));
+    let mut device = with(points);
+    device.wire.watchdog = Some(4);
+    device
+}
+
+/// A reading that is a current or a voltage, as a code in EEPROM says.
+fn selectable() -> Device {
+    let names = vec![(0, "current".to_string()), (1, "voltage".to_string()), (2, "off".to_string())];
+    let mut mode_form = Form::new(Kind::U16);
+    mode_form.names = Names::All(names);
+    let mode = formed(point("mode", register(Table::Holding, 16, 1), Poll::Slow), mode_form);
+    let mut mode = writable(mode, WriteRule::Any);
+    mode.persistent = true;
+    let mut value = point("value", register(Table::Input, 0, 1), Poll::Fast);
+    let case = |key, name: &str, unit: Option<&str>| Case { key, name: name.into(), form: unit.map(tenths) };
+    value.encoding = Encoding::Cases {
+        by: 0,
+        cases: vec![case(0, "current", Some("mA")), case(1, "voltage", Some("V")), case(2, "off", None)],
+    };
+    with(vec![mode, value])
+}
+
+/// 0 or 1, or 11111 for "automatic".
+fn order() -> Point {
+    let mut form = Form::new(Kind::U16);
+    form.names = Names::All(vec![(0, "OFF".into()), (1, "ON".into()), (11111, "automatic".into())]);
+    writable(formed(point("order", register(Table::Holding, 1, 1), Poll::Fast), form), WriteRule::Any)
+}
+
+/// A number that the device limits to 100 whatever the profile says.
+fn master() -> Point {
+    writable(point("level", register(Table::Holding, 2, 1), Poll::Fast), range("0", "255"))
+}
+
+fn range(min: &str, max: &str) -> WriteRule {
+    let decimal = |text: &str| Decimal::parse(text).expect("a decimal");
+    WriteRule::Range { min: decimal(min), max: decimal(max), step: None }
+}
+
+fn tenths(unit: &str) -> Form {
+    let mut form = Form::new(Kind::I16);
+    form.decimals = Some(Decimals::Fixed(1));
+    form.unit = Unit::Fixed(unit.into());
+    form
+}
+
+fn register(table: Table, first: u16, count: u16) -> Address {
+    Address { span: Span::with_count(table, first, count).expect("a span"), bits: None }
+}
+
+fn formed(mut point: Point, form: Form) -> Point {
+    point.encoding = Encoding::Plain(form);
+    point
+}
+
+fn writable(mut point: Point, rule: WriteRule) -> Point {
+    point.write = Some(Write { at: point.at, with: None, rule });
+    point
+}
+
+fn flag(name: &str, at: Address, poll: Poll) -> Point {
+    formed(point(name, at, poll), Form::new(Kind::Bool))
+}
+
+fn point(name: &str, at: Address, poll: Poll) -> Point {
+    let kind = if at.span.count() == 2 { Kind::U32 } else { Kind::U16 };
+    Point {
+        name: name.into(),
+        at,
+        also: None,
+        encoding: Encoding::Plain(Form::new(kind)),
+        poll,
+        write: None,
+        persistent: false,
+        read_clears: false,
+        default: None,
+        re_read: Vec::new(),
+        deadband: None,
+        presentation: Presentation::default(),
+    }
+}
+
+fn with(points: Vec<Point>) -> Device {
+    Device {
+        profile: "test/device".into(),
+        manufacturer: "Test".into(),
+        model: "T1".into(),
+        source: "a transcript".into(),
+        identify: None,
+        wire: Wire {
+            limits: Limits::default(),
+            readable: Vec::new(),
+            forbidden: Vec::new(),
+            intervals: Intervals { fast: Duration::from_secs(1), slow: Duration::from_secs(30) },
+            response_timeout: None,
+            quirks: Quirks::default(),
+            watchdog: None,
+        },
+        points,
+        left_out: Vec::new(),
+    }
+}

@@ -1,0 +1,294 @@
+//! Plays a transcript: reads what happens, lets the bus answer, writes everything down.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use busker::engine::address::{Span, Table};
+use busker::engine::bus::{Action, Bus, Command, Event, Severity};
+use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
+use busker::engine::time::{Duration, Time};
+
+use crate::devices;
+
+/// The transcript with everything that the bus does, anew.
+pub fn replay(transcript: &str) -> String {
+    let mut player: Option<Player> = None;
+    let mut header = String::new();
+    for line in transcript.lines() {
+        let Some((time, text)) = timed(line) else {
+            match &mut player {
+                None => header.push_str(&format!("{line}\n")),
+                Some(player) if line.starts_with('#') || line.is_empty() => player.remark(line),
+                Some(_) => panic!("not a line of a transcript: `{line}`"),
+            }
+            continue;
+        };
+        let player = player.get_or_insert_with(|| Player::new(&header));
+        if let Some(input) = text.strip_prefix("happens: ") {
+            player.happens(time, input);
+        }
+    }
+    player.expect("a transcript in which something happens").text
+}
+
+/// `   9.5 ms  text`
+fn timed(line: &str) -> Option<(Time, &str)> {
+    let (time, text) = line.trim_start().split_once(" ms  ")?;
+    let millis: f64 = time.parse().ok()?;
+    Some((Time((millis * 1000.0).round() as u64), text))
+}
+
+struct Player {
+    bus: Bus,
+    text: String,
+    now: Time,
+    in_flight: Option<(Request, Time, Duration)>,
+    /// Devices that answer by themselves: what they hold, by unit, table and address.
+    registers: BTreeMap<(u8, Table, u16), u16>,
+    answering: bool,
+    silent: Vec<u8>,
+    /// While devices answer by themselves, requests are counted instead of written down.
+    asked: BTreeMap<String, u32>,
+}
+
+const LATENCY: Duration = Duration::from_millis(9);
+
+impl Player {
+    fn new(header: &str) -> Player {
+        let bus = Bus::new(Time::default(), &devices::settings(header), 0);
+        let mut player = Player {
+            bus,
+            text: header.to_string(),
+            now: Time::default(),
+            in_flight: None,
+            registers: BTreeMap::new(),
+            answering: false,
+            silent: Vec::new(),
+            asked: BTreeMap::new(),
+        };
+        player.take_actions();
+        player
+    }
+
+    fn remark(&mut self, line: &str) {
+        self.text.push_str(line);
+        self.text.push('\n');
+    }
+
+    fn write(&mut self, what: &str) {
+        let _ = writeln!(self.text, "{:>12}  {what}", self.now.to_string());
+    }
+
+    /// Lets time run to `time`, then plays one input line.
+    fn happens(&mut self, time: Time, input: &str) {
+        self.run_until(time);
+        self.write(&format!("happens: {input}"));
+        let (verb, rest) = input.split_once(' ').unwrap_or((input, ""));
+        match verb {
+            "link-up" => self.bus.handle(self.now, Event::LinkUp),
+            "link-down" => {
+                self.in_flight = None;
+                self.bus.handle(self.now, Event::LinkDown(rest.to_string()));
+            }
+            "broker-up" => self.bus.handle(self.now, Event::BrokerUp),
+            "broker-down" => self.bus.handle(self.now, Event::BrokerDown),
+            "shutdown" => self.bus.handle(self.now, Event::Shutdown),
+            "set" | "retained-set" => {
+                let (place, payload) = rest.split_once(' ').expect("set device/point value");
+                let (device, point) = place.split_once('/').expect("device/point");
+                self.bus.handle(
+                    self.now,
+                    Event::Command(Command {
+                        device: device.into(),
+                        point: point.into(),
+                        payload: payload.into(),
+                        retained: verb == "retained-set",
+                    }),
+                );
+            }
+            "get" => {
+                let (device, point) = rest.split_once('/').expect("device/point");
+                self.bus.handle(self.now, Event::Get { device: device.into(), point: point.into() });
+            }
+            "answer" => self.answer(rest),
+            "devices-answer" => self.answering = true,
+            "silent" => self.silent.push(rest.parse().expect("a unit")),
+            "speaks" => self.silent.retain(|unit| unit.to_string() != rest),
+            "holds" => self.hold(rest),
+            "count" => self.write_counts(),
+            "nothing" => {}
+            _ => panic!("unknown input `{input}`"),
+        }
+        self.take_actions();
+    }
+
+    fn run_until(&mut self, time: Time) {
+        loop {
+            let reply_at =
+                self.in_flight.as_ref().filter(|_| self.answering).map(|(request, sent_at, timeout)| {
+                    *sent_at + if self.silent.contains(&request.unit) { *timeout } else { LATENCY }
+                });
+            let next = [reply_at, self.bus.wake_at()].into_iter().flatten().min();
+            match next {
+                Some(next) if next <= time => {
+                    self.now = next.max(self.now);
+                    if reply_at == Some(next) {
+                        self.answer_by_itself()
+                    } else {
+                        self.bus.handle(self.now, Event::Wake)
+                    }
+                    self.take_actions();
+                }
+                _ => break,
+            }
+        }
+        self.now = time;
+    }
+
+    fn take_actions(&mut self) {
+        while let Some(action) = self.bus.next_action() {
+            match action {
+                Action::Send { request, not_before, timeout } => {
+                    assert!(self.in_flight.is_none(), "two requests in flight");
+                    let text = format!("{} {}", request.unit, request.call);
+                    if self.answering {
+                        *self.asked.entry(text).or_default() += 1;
+                    } else {
+                        self.write(&format!("-> {text}   timeout {}", timeout.as_millis()));
+                    }
+                    self.in_flight = Some((request, not_before.max(self.now), timeout));
+                }
+                Action::Publish(message) => {
+                    let retained = if message.retain { "" } else { " (not retained)" };
+                    let payload = summary(&message.topic, &message.payload);
+                    self.write(&format!("publish {} {payload}{retained}", message.topic));
+                }
+                Action::Reopen { after } => self.write(&format!("reopen after {} ms", after.as_millis())),
+                Action::Say(severity, text) => {
+                    let mark = if severity == Severity::Warning { "warn" } else { "say" };
+                    self.write(&format!("{mark} {text}"));
+                }
+            }
+        }
+        if self.bus.is_finished() {
+            self.write("finished");
+        }
+    }
+
+    /// `0001 0002`, `silence`, `checksum`, `wrong-frame`, `exception 2`, `written`, `names A B`
+    fn answer(&mut self, text: &str) {
+        let Some((request, sent_at, _)) = self.in_flight.take() else {
+            return self.write("WRONG: nothing is in flight");
+        };
+        let result = match text.split_once(' ').unwrap_or((text, "")) {
+            ("silence", _) => Err(RequestError::Timeout),
+            ("checksum", _) => Err(RequestError::Checksum),
+            ("wrong-frame", _) => Err(RequestError::WrongFrame),
+            ("exception", code) => Err(RequestError::Exception(code.parse().expect("a code"))),
+            ("written", _) => Ok(Answer::Written),
+            ("names", names) => {
+                let objects = names.split(", ").enumerate();
+                Ok(Answer::Identification(busker::engine::modbus::Identification {
+                    conformity: 1,
+                    next: None,
+                    objects: objects.map(|(id, name)| (id as u8, name.to_string())).collect(),
+                }))
+            }
+            _ => match words(&request, text) {
+                Some(answer) => Ok(answer),
+                None => return self.write(&format!("WRONG: not an answer to {}", request.call)),
+            },
+        };
+        self.reply(sent_at, result);
+    }
+
+    fn answer_by_itself(&mut self) {
+        let (request, sent_at, _) = self.in_flight.take().expect("a request in flight");
+        if self.silent.contains(&request.unit) {
+            return self.reply(sent_at, Err(RequestError::Timeout));
+        }
+        let unit = request.unit;
+        let answer = match request.call {
+            Call::Read(span) => {
+                let held =
+                    (span.first()..=span.last()).map(|at| self.registers.get(&(unit, span.table(), at)));
+                answer_of(span, held.map(|word| word.copied().unwrap_or(0)).collect())
+            }
+            Call::WriteCoil { address, on } => {
+                self.registers.insert((unit, Table::Coil, address), u16::from(on));
+                Answer::Written
+            }
+            Call::WriteRegister { address, word } => {
+                self.registers.insert((unit, Table::Holding, address), word);
+                Answer::Written
+            }
+            other => panic!("devices do not answer {other} by themselves"),
+        };
+        self.reply(sent_at, Ok(answer));
+    }
+
+    fn reply(&mut self, sent_at: Time, result: Result<Answer, RequestError>) {
+        let heard = if result == Err(RequestError::Timeout) { None } else { Some(self.now) };
+        let discarded = Discarded::default();
+        let reply = Reply { result, sent_at, first_byte_at: heard, last_byte_at: heard, discarded };
+        self.bus.handle(self.now, Event::Reply(reply));
+    }
+
+    /// `1 input 0: 0001 0002`
+    fn hold(&mut self, text: &str) {
+        let (place, words) = text.split_once(": ").expect("unit table address: words");
+        let place: Vec<&str> = place.split(' ').collect();
+        let unit = place[0].parse().expect("a unit");
+        let table = Table::from_name(place[1]).expect("a table");
+        let first: u16 = place[2].parse().expect("an address");
+        for (offset, word) in words.split(' ').enumerate() {
+            let word = u16::from_str_radix(word, 16).expect("a word in hexadecimal");
+            self.registers.insert((unit, table, first + offset as u16), word);
+        }
+    }
+
+    fn write_counts(&mut self) {
+        for (text, count) in std::mem::take(&mut self.asked) {
+            self.write(&format!("asked {count} times: {text}"));
+        }
+    }
+}
+
+fn words(request: &Request, text: &str) -> Option<Answer> {
+    let words: Vec<u16> =
+        text.split_whitespace().map(|word| u16::from_str_radix(word, 16)).collect::<Result<_, _>>().ok()?;
+    match request.call {
+        Call::Read(span) if words.len() as u32 == span.count() => Some(answer_of(span, words)),
+        _ => None,
+    }
+}
+
+fn answer_of(span: Span, words: Vec<u16>) -> Answer {
+    if span.table().is_bits() {
+        return Answer::Bits(words.into_iter().map(|word| word != 0).collect());
+    }
+    Answer::Words(words)
+}
+
+/// Discovery and info are too long to read here; what changes in them is what matters.
+fn summary(topic: &str, payload: &str) -> String {
+    let parse = || -> serde_json::Value { serde_json::from_str(payload).expect("a JSON payload") };
+    if topic.ends_with("/info") {
+        let info = parse();
+        return format!("online {}, reason {}, missing {}", info["online"], info["reason"], info["missing"]);
+    }
+    if !topic.starts_with("homeassistant/") {
+        return payload.to_string();
+    }
+    let payload = parse();
+    let components = payload["components"].as_object().expect("components");
+    let keys: Vec<String> = components
+        .iter()
+        .map(|(key, component)| {
+            // A component with nothing but its platform is a tombstone.
+            let gone = component.as_object().is_some_and(|component| component.len() == 1);
+            format!("{key}{}", if gone { " (gone)" } else { "" })
+        })
+        .collect();
+    format!("announces {}", keys.join(", "))
+}
