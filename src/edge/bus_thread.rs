@@ -1,0 +1,275 @@
+//! The loop around [`crate::engine::bus::Bus`]: one thread per bus performs what the engine
+//! decides.
+//!
+//! A thread and not a task: the silence between two frames is 2 ms, and a timer that is a
+//! millisecond late costs a tenth of a fast line.
+
+use std::num::NonZeroU64;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+use tokio::sync::oneshot;
+
+use crate::edge::bell::Bell;
+use crate::edge::clock::Clock;
+use crate::edge::guarded_link::{GuardedLink, wait};
+use crate::edge::link::{Link, Lost};
+use crate::engine::bus::{Action, Bus, Event, Severity};
+use crate::engine::modbus::Reply;
+use crate::engine::modbus::guard::Guard;
+use crate::engine::settings::Settings;
+use crate::engine::time::Time;
+use crate::engine::topics::Message;
+
+/// Commands and questions that may wait for the thread. The loop takes all of them between two
+/// looks at the line, so this fills only when something floods it; then [`Full`] is returned.
+const WAITING_MAX: usize = 256;
+
+/// Talks to a bus's thread. Dropping it does not stop the thread.
+pub struct BusHandle {
+    letters: SyncSender<Letter>,
+    bell: Bell,
+    stop: Arc<AtomicBool>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+/// Too much waits for the bus already; what was to be sent is dropped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Full;
+
+enum Letter {
+    Event(Event),
+    Inspect(Look),
+}
+
+/// Something that looks at the bus on its thread.
+type Look = Box<dyn FnOnce(&Bus, Time) + Send>;
+
+/// Starts the thread of the bus number `index`. `publish` is called on that thread and must not
+/// wait.
+pub fn start(
+    settings: Arc<Settings>,
+    index: usize,
+    clock: Clock,
+    publish: Box<dyn Fn(Message) + Send>,
+) -> std::io::Result<BusHandle> {
+    let (letters, inbox) = sync_channel(WAITING_MAX);
+    let bell = Bell::new()?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let (thread_bell, thread_stop) = (bell.clone(), stop.clone());
+    let thread =
+        std::thread::Builder::new().name(format!("bus-{}", settings.buses[index].name)).spawn(move || {
+            let bus = Bus::new(clock.now(), &settings, index);
+            let port = Port::Closed;
+            let (bell, stop) = (thread_bell, thread_stop);
+            BusThread { settings, index, clock, publish, bus, port, inbox, bell, stop, stopping: false }
+                .run();
+        })?;
+    Ok(BusHandle { letters, bell, stop, thread: Mutex::new(Some(thread)) })
+}
+
+impl BusHandle {
+    /// Hands an event to the bus.
+    pub fn send(&self, event: Event) -> Result<(), Full> {
+        self.post(Letter::Event(event))
+    }
+
+    /// Runs `look` on the bus's thread, at once, even while a request is in flight. The receiver
+    /// fails if the thread has ended or too much waits for it.
+    pub fn inspect<T: Send + 'static>(
+        &self,
+        look: impl FnOnce(&Bus, Time) -> T + Send + 'static,
+    ) -> oneshot::Receiver<T> {
+        let (sender, receiver) = oneshot::channel();
+        let look = move |bus: &Bus, now: Time| {
+            // Nobody may be waiting for it any more.
+            let _ = sender.send(look(bus, now));
+        };
+        // What does not fit drops the sender, which the receiver notices.
+        let _ = self.post(Letter::Inspect(Box::new(look)));
+        receiver
+    }
+
+    /// Asks the bus to finish the request in flight, refuse what waits, say `offline` and end.
+    pub fn shutdown(&self) {
+        self.stop.store(true, Ordering::SeqCst);
+        self.bell.ring();
+    }
+
+    /// Waits for the thread's end.
+    pub fn join(&self) {
+        let thread = self.thread.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).take();
+        if let Some(thread) = thread {
+            if thread.join().is_err() {
+                tracing::error!("a bus thread ended in a panic");
+            }
+        }
+    }
+
+    fn post(&self, letter: Letter) -> Result<(), Full> {
+        let result = self.letters.try_send(letter).map_err(|_| Full);
+        self.bell.ring();
+        result
+    }
+}
+
+/// The link, from closed to open and back.
+enum Port {
+    Closed,
+    /// To be opened then.
+    Waiting(Time),
+    /// Being opened by a thread of its own, because that may take seconds.
+    Opening(Receiver<Result<Link, Lost>>),
+    Open(Box<GuardedLink>),
+}
+
+struct BusThread {
+    settings: Arc<Settings>,
+    index: usize,
+    clock: Clock,
+    publish: Box<dyn Fn(Message) + Send>,
+    bus: Bus,
+    port: Port,
+    inbox: Receiver<Letter>,
+    bell: Bell,
+    stop: Arc<AtomicBool>,
+    stopping: bool,
+}
+
+impl BusThread {
+    fn run(mut self) {
+        // By default the kernel may wake a thread 50 µs late to save power.
+        if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
+            tracing::debug!("the timer slack stays as it is: {error}");
+        }
+        loop {
+            self.perform();
+            if self.bus.is_finished() {
+                return;
+            }
+            self.wait();
+            self.bell.silence();
+            self.read_letters();
+            self.stop_if_asked();
+            self.advance_port();
+            if self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
+                self.handle(Event::Wake);
+            }
+        }
+    }
+
+    fn handle(&mut self, event: Event) {
+        self.bus.handle(self.clock.now(), event);
+        self.perform();
+    }
+
+    fn perform(&mut self) {
+        while let Some(action) = self.bus.next_action() {
+            match action {
+                Action::Send { request, not_before, timeout } => {
+                    let begun = match &mut self.port {
+                        Port::Open(link) => link.begin(&request, not_before, timeout),
+                        _ => Err(Lost("the link is not open".into())),
+                    };
+                    self.line_said(begun);
+                }
+                Action::Publish(message) => (self.publish)(message),
+                Action::Reopen { after } => self.port = Port::Waiting(self.clock.now() + after),
+                Action::Say(Severity::Info, text) => tracing::info!("{text}"),
+                Action::Say(Severity::Warning, text) => tracing::warn!("{text}"),
+            }
+        }
+    }
+
+    fn wait(&mut self) {
+        let (link, port_wakes_at) = match &self.port {
+            Port::Closed | Port::Opening(_) => (None, None),
+            Port::Waiting(open_at) => (None, Some(*open_at)),
+            Port::Open(link) => (Some(&**link), link.wake_at()),
+        };
+        let wake_at = port_wakes_at.into_iter().chain(self.bus.wake_at()).min();
+        let waited = wait(link, Some(&self.bell), wake_at.map(|at| self.clock.until(at)));
+        if let Err(lost) = waited {
+            self.lose(lost);
+        }
+    }
+
+    fn read_letters(&mut self) {
+        // At most as many as can wait, so that a flood does not keep the line waiting.
+        for _ in 0..WAITING_MAX {
+            match self.inbox.try_recv() {
+                Ok(Letter::Event(event)) => self.handle(event),
+                Ok(Letter::Inspect(look)) => look(&self.bus, self.clock.now()),
+                Err(TryRecvError::Empty | TryRecvError::Disconnected) => return,
+            }
+        }
+        self.bell.ring();
+    }
+
+    fn stop_if_asked(&mut self) {
+        if self.stopping || !self.stop.load(Ordering::SeqCst) {
+            return;
+        }
+        self.stopping = true;
+        self.handle(Event::Shutdown);
+        if let Port::Open(link) = &mut self.port {
+            if let Some(reply) = link.withdraw("busker stops") {
+                self.handle(Event::Reply(reply));
+            }
+        }
+    }
+
+    fn advance_port(&mut self) {
+        match &mut self.port {
+            Port::Closed => {}
+            Port::Waiting(open_at) if self.clock.now() < *open_at => {}
+            Port::Waiting(_) => self.port = self.open(),
+            Port::Opening(opened) => match opened.try_recv() {
+                Ok(Ok(link)) => {
+                    let bus = &self.settings.buses[self.index];
+                    let guard = Guard::new(&bus.link, bus.gap);
+                    self.port = Port::Open(Box::new(GuardedLink::new(link, guard, self.clock)));
+                    self.handle(Event::LinkUp);
+                }
+                Ok(Err(lost)) => self.lose(lost),
+                Err(TryRecvError::Empty) => {}
+                Err(TryRecvError::Disconnected) => self.lose(Lost("it could not be opened".into())),
+            },
+            Port::Open(link) => {
+                let said = link.advance();
+                self.line_said(said);
+            }
+        }
+    }
+
+    fn open(&self) -> Port {
+        let (sender, receiver) = sync_channel(1);
+        let (settings, index, bell) = (self.settings.clone(), self.index, self.bell.clone());
+        let opener = std::thread::Builder::new().name("open".into()).spawn(move || {
+            // When the bus stops meanwhile, the link is closed again with the channel.
+            let _ = sender.send(Link::open(&settings.buses[index].link));
+            bell.ring();
+        });
+        if let Err(error) = opener {
+            tracing::error!("no thread can be started: {error}");
+        }
+        Port::Opening(receiver)
+    }
+
+    fn line_said(&mut self, said: Result<Option<Reply>, Lost>) {
+        match said {
+            Ok(Some(reply)) => self.handle(Event::Reply(reply)),
+            Ok(None) => {}
+            Err(lost) => self.lose(lost),
+        }
+    }
+
+    /// Closes the descriptor at once: as long as it is held, an adapter that comes back gets
+    /// another name.
+    fn lose(&mut self, Lost(reason): Lost) {
+        self.port = Port::Closed;
+        self.handle(Event::LinkDown(reason));
+    }
+}

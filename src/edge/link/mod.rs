@@ -1,0 +1,111 @@
+//! A link moves bytes: a serial port or a TCP connection, both as a descriptor that never blocks.
+
+mod serial;
+mod tcp;
+
+use std::fmt;
+use std::io;
+use std::net::TcpStream;
+use std::os::fd::{AsFd, BorrowedFd};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use crate::engine::settings;
+use crate::engine::time::Duration;
+
+/// An open link. Dropping it closes the descriptor at once, so that an adapter that comes back
+/// finds its name free.
+#[derive(Debug)]
+pub enum Link {
+    Serial(serial::Port),
+    Tcp(TcpStream),
+}
+
+/// The link is of no use any more, and why, in words for people.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Lost(pub String);
+
+impl fmt::Display for Lost {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl Link {
+    /// Opens the port or connects; this may take seconds. The error says what is wrong and what
+    /// would be right.
+    pub fn open(settings: &settings::Link) -> Result<Link, Lost> {
+        match settings {
+            settings::Link::Serial { path, line } => serial::Port::open(path, *line).map(Link::Serial),
+            settings::Link::Tcp { host, port } | settings::Link::RtuOverTcp { host, port, .. } => {
+                tcp::connect(host, *port).map(Link::Tcp)
+            }
+        }
+    }
+
+    /// Reads what is there: `None` when nothing is.
+    pub fn read(&self, buffer: &mut [u8]) -> Result<Option<usize>, Lost> {
+        match rustix::io::read(self.as_fd(), buffer) {
+            // End of file: the adapter was unplugged, the other side closed.
+            Ok(0) => Err(self.ended()),
+            Ok(count) => Ok(Some(count)),
+            Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(None),
+            Err(error) => Err(self.failed(error.into())),
+        }
+    }
+
+    /// Writes all of a frame.
+    pub fn write(&self, mut bytes: &[u8]) -> Result<(), Lost> {
+        while !bytes.is_empty() {
+            match rustix::io::write(self.as_fd(), bytes) {
+                Ok(count) => bytes = &bytes[count..],
+                Err(rustix::io::Errno::INTR) => {}
+                Err(rustix::io::Errno::AGAIN) => self.wait_for_room()?,
+                Err(error) => return Err(self.failed(error.into())),
+            }
+        }
+        Ok(())
+    }
+
+    fn wait_for_room(&self) -> Result<(), Lost> {
+        let mut descriptors = [PollFd::new(self, PollFlags::OUT)];
+        match poll(&mut descriptors, Some(&timespec(WRITE_TIMEOUT))) {
+            Ok(0) => Err(Lost("nothing can be written to it".into())),
+            Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
+            Err(error) => Err(self.failed(error.into())),
+        }
+    }
+
+    fn ended(&self) -> Lost {
+        Lost(match self {
+            Link::Serial(_) => "unplugged".into(),
+            Link::Tcp(_) => "closed by the other side".into(),
+        })
+    }
+
+    fn failed(&self, error: io::Error) -> Lost {
+        use rustix::io::Errno;
+        let unplugged = [Errno::IO, Errno::NODEV, Errno::NXIO];
+        match (self, rustix::io::Errno::from_io_error(&error)) {
+            (Link::Serial(_), Some(errno)) if unplugged.contains(&errno) => self.ended(),
+            _ => Lost(error.to_string()),
+        }
+    }
+}
+
+/// A frame that the kernel does not take within this time is written to a dead link.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
+
+impl AsFd for Link {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        match self {
+            Link::Serial(port) => port.as_fd(),
+            Link::Tcp(stream) => stream.as_fd(),
+        }
+    }
+}
+
+/// The kernel's words for a duration.
+pub fn timespec(duration: Duration) -> Timespec {
+    Timespec { tv_sec: duration.as_secs() as i64, tv_nsec: duration.subsec_nanos().into() }
+}

@@ -1,0 +1,90 @@
+//! A serial port, raw: eight data bits, no flow control, no line discipline.
+
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+use rustix::io::Errno;
+use rustix::termios::{self, ControlModes, InputModes, OptionalActions, QueueSelector, SpecialCodeIndex};
+
+use crate::edge::link::Lost;
+use crate::engine::settings::{Line, Parity};
+
+/// An open port that no other program can open.
+#[derive(Debug)]
+pub struct Port {
+    descriptor: OwnedFd,
+}
+
+impl Port {
+    pub fn open(path: &str, line: Line) -> Result<Port, Lost> {
+        let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let descriptor = open(path, flags, Mode::empty()).map_err(|error| why_not_opened(path, error))?;
+        // Two locks: programs that know only one of them are kept out as well.
+        flock(&descriptor, FlockOperation::NonBlockingLockExclusive)
+            .map_err(|error| why_not_opened(path, error))?;
+        configure(&descriptor, line).map_err(|error| match error {
+            Errno::NOTTY => Lost(format!("`{path}` is no serial port")),
+            error => Lost(format!("`{path}` does not take {} baud: {error}", line.baud)),
+        })?;
+        termios::ioctl_tiocexcl(&descriptor).map_err(|error| why_not_opened(path, error))?;
+        Ok(Port { descriptor })
+    }
+}
+
+impl AsFd for Port {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.descriptor.as_fd()
+    }
+}
+
+impl Drop for Port {
+    fn drop(&mut self) {
+        // A terminal that somebody else holds open would stay exclusive. On an unplugged one it
+        // fails, and does not matter.
+        let _ = termios::ioctl_tiocnxcl(&self.descriptor);
+    }
+}
+
+fn configure(descriptor: &OwnedFd, line: Line) -> Result<(), Errno> {
+    let mut settings = termios::tcgetattr(descriptor)?;
+    settings.make_raw();
+    // A read returns what is there, and 0 only when the adapter is gone.
+    settings.special_codes[SpecialCodeIndex::VMIN] = 1;
+    settings.special_codes[SpecialCodeIndex::VTIME] = 0;
+    settings.input_modes &= !(InputModes::INPCK | InputModes::IXOFF | InputModes::IXANY);
+    let modes = &mut settings.control_modes;
+    *modes &= !(ControlModes::CSIZE
+        | ControlModes::PARENB
+        | ControlModes::PARODD
+        | ControlModes::CSTOPB
+        | ControlModes::CRTSCTS);
+    *modes |= ControlModes::CS8 | ControlModes::CREAD | ControlModes::CLOCAL;
+    *modes |= match line.parity {
+        Parity::None => ControlModes::empty(),
+        Parity::Even => ControlModes::PARENB,
+        Parity::Odd => ControlModes::PARENB | ControlModes::PARODD,
+    };
+    if line.stop_bits == 2 {
+        *modes |= ControlModes::CSTOPB;
+    }
+    settings.set_speed(line.baud)?;
+    termios::tcsetattr(descriptor, OptionalActions::Now, &settings)?;
+    // The kernel reports no error for a speed that the driver refused.
+    if termios::tcgetattr(descriptor)?.output_speed() != line.baud {
+        return Err(Errno::INVAL);
+    }
+    termios::tcflush(descriptor, QueueSelector::IOFlush)
+}
+
+fn why_not_opened(path: &str, error: Errno) -> Lost {
+    Lost(match error {
+        Errno::NOENT | Errno::NODEV | Errno::NXIO | Errno::IO => {
+            format!("`{path}` is not there; is the adapter plugged in?")
+        }
+        Errno::ACCESS | Errno::PERM => {
+            format!("no permission to open `{path}`; add the user to the group that owns it (`dialout`)")
+        }
+        Errno::BUSY | Errno::WOULDBLOCK => format!("`{path}` is in use by another program"),
+        error => format!("`{path}` cannot be opened: {error}"),
+    })
+}

@@ -1,0 +1,26 @@
+//! A TCP connection, for Modbus TCP and for RTU frames through a serial server.
+
+use std::net::{TcpStream, ToSocketAddrs};
+
+use crate::edge::link::Lost;
+use crate::engine::time::Duration;
+
+/// How long each address of a host is tried.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
+
+pub fn connect(host: &str, port: u16) -> Result<TcpStream, Lost> {
+    let lost = |error: std::io::Error| Lost(format!("`{host}:{port}` cannot be reached: {error}"));
+    let mut failure = Lost(format!("`{host}` has no address"));
+    for address in (host, port).to_socket_addrs().map_err(lost)? {
+        match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
+            Ok(stream) => {
+                // A request is one small packet and must not wait for a second.
+                stream.set_nodelay(true).map_err(lost)?;
+                stream.set_nonblocking(true).map_err(lost)?;
+                return Ok(stream);
+            }
+            Err(error) => failure = lost(error),
+        }
+    }
+    Err(failure)
+}
