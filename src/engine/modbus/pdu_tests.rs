@@ -1,3 +1,5 @@
+//! Requests as bytes and bytes as answers, checked against the specification's own examples.
+
 use super::*;
 
 /// Bytes from text such as `03 00 6B`.

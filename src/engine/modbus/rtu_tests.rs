@@ -1,3 +1,5 @@
+//! The guard of an RTU line against everything that a line can do.
+
 use proptest::prelude::*;
 
 use super::*;

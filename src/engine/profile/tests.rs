@@ -1,3 +1,5 @@
+//! Profiles as they load.
+
 use super::*;
 
 #[test]

@@ -1,3 +1,5 @@
+//! The YAML reader: values, faults, and their places.
+
 use super::*;
 use crate::engine::time::Duration;
 use crate::engine::value::Decimal;
