@@ -42,7 +42,7 @@ impl DeviceState {
     }
 
     /// The last word before the end.
-    pub(super) fn say_offline(&mut self, context: &mut Context) {
+    pub(in crate::engine::bus) fn say_offline(&mut self, context: &mut Context) {
         self.publish_availability(false, context);
     }
 
@@ -103,7 +103,7 @@ impl DeviceState {
         }
     }
 
-    pub(super) fn report(&self) -> DeviceReport {
+    pub(in crate::engine::bus) fn report(&self) -> DeviceReport {
         let points = self.settings.device.points.iter().enumerate().filter(|(_, point)| point.is_read());
         DeviceReport {
             name: self.settings.name.clone(),
