@@ -62,10 +62,10 @@ fn help() -> String {
          Commands, in a script and on standard input:\n{COMMANDS}\n\
          Faults, each for all units or with `unit=N`, for all requests or with `every=N`:\n  {KINDS}\n\n\
          Example:\n  \
-         busker simulate metz-connect/mr-do4@18 metz-connect/mr-si4@20 --pty /tmp/line --tcp 127.0.0.1:1502\n  \
+         busker simulate metz-connect/mr-do4@18 metz-connect/mr-ai8@19 --pty /tmp/line --tcp 127.0.0.1:1502\n  \
          and then, on its standard input:\n  \
          unit 18 relay 2 hand on\n  \
-         at 5s unit 20 input 1 pulses 100 every 80ms"
+         at 5s unit 19 input 1 ohms 107.8"
     )
 }
 
