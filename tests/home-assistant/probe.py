@@ -1,0 +1,199 @@
+"""A real Home Assistant core without its web server, told what to do in JSON lines.
+
+    .home-assistant/venv/bin/python tests/home-assistant/probe.py FOLDER BROKER_PORT
+
+FOLDER is Home Assistant's configuration folder and keeps its registries over a restart. Each line on
+standard input is a command with a `do`; each gets one line of answer on standard output, `{"is": …}` or
+`{"failed": "…"}`. The first line out says that Home Assistant is up.
+
+    {"do": "entities"}                    every MQTT entity, with what a user would see of it
+    {"do": "devices"}                     every MQTT device
+    {"do": "wait", "for": {ID: {…}, …}, "seconds": 20}
+                                          until the entities with these unique ids look like this: `state`,
+                                          `unit`, `exists` (false: not there at all)
+    {"do": "call", "service": "switch.turn_on", "entity": ID, "data": {…}}
+    {"do": "log"}                         what was logged as a warning or worse, and open repair issues
+    {"do": "quit"}
+"""
+
+import asyncio
+import json
+import logging
+import os
+import pathlib
+import sys
+
+from homeassistant import bootstrap, core, loader, runner
+from homeassistant.const import EVENT_STATE_CHANGED, __version__
+from homeassistant.helpers import device_registry, entity_registry, issue_registry
+
+CORE = {
+    "name": "busker's test", "latitude": 48, "longitude": 8, "elevation": 0, "unit_system": "metric",
+    "time_zone": "UTC", "currency": "EUR", "country": "DE",
+}
+
+
+class Warnings(logging.Handler):
+    """Keeps what Home Assistant would show a user in its log."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        fault = f" ({record.exc_info[1]!r})" if record.exc_info else ""
+        self.lines.append(f"{record.levelname} {record.name}: {record.getMessage()}{fault}")
+
+
+class Probe:
+    def __init__(self, hass: core.HomeAssistant, warnings: Warnings) -> None:
+        self.hass, self.warnings = hass, warnings
+        self.changed = asyncio.Event()
+        hass.bus.async_listen(EVENT_STATE_CHANGED, self.notice)
+        hass.bus.async_listen(entity_registry.EVENT_ENTITY_REGISTRY_UPDATED, self.notice)
+
+    @core.callback
+    def notice(self, _: core.Event) -> None:
+        self.changed.set()
+
+    def registered(self) -> dict:
+        entries = entity_registry.async_get(self.hass).entities.values()
+        return {entry.unique_id: entry for entry in entries if entry.platform == "mqtt"}
+
+    def entity(self, entry) -> dict:
+        state = self.hass.states.get(entry.entity_id)
+        attributes = state.attributes if state else {}
+        device = device_registry.async_get(self.hass).async_get(entry.device_id)
+        return {
+            "entity_id": entry.entity_id,
+            "platform": entry.domain,
+            "name": entry.original_name,
+            "device": next(iter(device.identifiers))[1] if device else None,
+            "device_class": entry.original_device_class,
+            "state_class": attributes.get("state_class"),
+            "unit": attributes.get("unit_of_measurement"),
+            "category": entry.entity_category.value if entry.entity_category else None,
+            "enabled": entry.disabled_by is None,
+            "options": attributes.get("options"),
+            "min": attributes.get("min"),
+            "max": attributes.get("max"),
+            "state": state.state if state else None,
+        }
+
+    async def entities(self, _: dict) -> dict:
+        return {unique_id: self.entity(entry) for unique_id, entry in self.registered().items()}
+
+    async def devices(self, _: dict) -> dict:
+        registry = device_registry.async_get(self.hass)
+        entry = self.hass.config_entries.async_entries("mqtt")[0]
+        found = {}
+        for device in device_registry.async_entries_for_config_entry(registry, entry.entry_id):
+            via = registry.async_get(device.via_device_id) if device.via_device_id else None
+            found[next(iter(device.identifiers))[1]] = {
+                "name": device.name,
+                "manufacturer": device.manufacturer,
+                "model": device.model,
+                "via": next(iter(via.identifiers))[1] if via else None,
+            }
+        return found
+
+    def missing(self, wanted: dict) -> dict:
+        """Those of the wanted entities that do not look as they should, and how they look."""
+        registered = self.registered()
+        missing = {}
+        for unique_id, facts in wanted.items():
+            entry = registered.get(unique_id)
+            seen = self.entity(entry) if entry else {}
+            wants = {key: value for key, value in facts.items() if key != "exists"}
+            if facts.get("exists", True) != (entry is not None) or any(
+                seen.get(key) != value for key, value in wants.items()
+            ):
+                missing[unique_id] = {key: seen.get(key) for key in facts} if entry else "no such entity"
+        return missing
+
+    async def wait(self, command: dict) -> None:
+        deadline = asyncio.get_running_loop().time() + command["seconds"]
+        while missing := self.missing(command["for"]):
+            self.changed.clear()
+            left = deadline - asyncio.get_running_loop().time()
+            try:
+                await asyncio.wait_for(self.changed.wait(), left)
+            except TimeoutError:
+                raise TimeoutError(f"after {command['seconds']} s: {missing}") from None
+
+    async def call(self, command: dict) -> None:
+        domain, service = command["service"].split(".")
+        target = {"entity_id": self.registered()[command["entity"]].entity_id}
+        await self.hass.services.async_call(domain, service, {**target, **command.get("data", {})}, blocking=True)
+
+    async def log(self, _: dict) -> list[str]:
+        issues = issue_registry.async_get(self.hass).issues.values()
+        return self.warnings.lines + [f"issue {issue.issue_id}" for issue in issues if issue.active]
+
+    async def serve(self, commands: asyncio.StreamReader) -> None:
+        while line := await commands.readline():
+            command = json.loads(line)
+            if command["do"] == "quit":
+                return
+            try:
+                tell({"is": await getattr(self, command["do"])(command)})
+            except Exception as fault:  # noqa: BLE001: whatever it is, the test is to say it
+                tell({"failed": f"{type(fault).__name__}: {fault}"})
+
+
+answers = os.fdopen(os.dup(1), "w", buffering=1)
+
+
+def tell(answer: dict) -> None:
+    answers.write(json.dumps(answer) + "\n")
+
+
+def prepare(folder: pathlib.Path, broker_port: int) -> None:
+    """What a user has done who has set up the MQTT integration."""
+    storage = folder / ".storage"
+    if storage.exists():
+        return
+    storage.mkdir(parents=True)
+    (folder / "configuration.yaml").write_text("homeassistant:\n")
+    entry = {
+        "entry_id": "mqtt", "domain": "mqtt", "title": "broker", "version": 1, "minor_version": 2,
+        "data": {"broker": "127.0.0.1", "port": broker_port}, "options": {}, "source": "user", "unique_id": None,
+        "disabled_by": None, "pref_disable_new_entities": False, "pref_disable_polling": False,
+    }
+    entries = {"version": 1, "minor_version": 1, "key": "core.config_entries", "data": {"entries": [entry]}}
+    (storage / "core.config_entries").write_text(json.dumps(entries))
+
+
+async def main(folder: pathlib.Path, broker_port: int) -> None:
+    prepare(folder, broker_port)
+    warnings = Warnings()
+    logging.getLogger().addHandler(warnings)
+
+    hass = core.HomeAssistant(str(folder))
+    loader.async_setup(hass)
+    hass.config.skip_pip = True
+    # The MQTT integration asks for the web server and what stands on it; nobody here opens a page.
+    for part in ("http", "file_upload", "websocket_api", "auth", "api", "network"):
+        hass.config.components.add(part)
+    bootstrap.DEFAULT_INTEGRATIONS = set()
+    bootstrap.CRITICAL_INTEGRATIONS = set()
+    if await bootstrap.async_from_config_dict({"homeassistant": CORE}, hass) is None:
+        tell({"failed": "; ".join(warnings.lines) or "Home Assistant did not start"})
+        return
+    probe = Probe(hass, warnings)
+    await hass.async_start()
+    tell({"is": {"home_assistant": __version__, "python": sys.version.split()[0]}})
+
+    commands = asyncio.StreamReader(limit=1 << 20)
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
+    await probe.serve(commands)
+    await hass.async_stop()
+
+
+if __name__ == "__main__":
+    os.dup2(2, 1)  # whatever else is printed must not look like an answer
+    loop = runner.create_event_loop(False)
+    asyncio.set_event_loop(loop)
+    loop.run_until_complete(main(pathlib.Path(sys.argv[1]), int(sys.argv[2])))
+    answers.flush()
+    os._exit(0)  # threads of Home Assistant would only delay the end
