@@ -9,8 +9,8 @@ standard input is a command with a `do`; each gets one line of answer on standar
     {"do": "entities"}                    every MQTT entity, with what a user would see of it
     {"do": "devices"}                     every MQTT device
     {"do": "wait", "for": {ID: {…}, …}, "seconds": 20}
-                                          until the entities with these unique ids look like this: `state`,
-                                          `unit`, `exists` (false: not there at all)
+                                          until the entities with these unique ids look like this: any of
+                                          what `entities` tells, and `exists` (false: not there at all)
     {"do": "call", "service": "switch.turn_on", "entity": ID, "data": {…}}
     {"do": "log"}                         what was logged as a warning or worse, and open repair issues
     {"do": "quit"}
@@ -78,6 +78,7 @@ class Probe:
             "min": attributes.get("min"),
             "max": attributes.get("max"),
             "state": state.state if state else None,
+            "known": state is not None and state.state not in ("unavailable", "unknown"),
         }
 
     async def entities(self, _: dict) -> dict:
