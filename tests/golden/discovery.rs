@@ -1,0 +1,85 @@
+//! What Home Assistant is told of each device, in the states that make a difference.
+
+use busker::engine::device::Device;
+use busker::engine::homeassistant::{Gateway, announcement};
+use busker::engine::settings::DeviceSettings;
+use busker::engine::topics::Topics;
+use serde_json::{Map, Value};
+
+/// States of selectors beside the one a device leaves the factory with: what they are called, and
+/// what which points hold (a point's name without a number means all its repetitions).
+const STATES: &[(&str, &str, &[(&str, i128)])] = &[
+    ("metz-connect/mr-ai8", "pt1000 as float, °C", &[("code", 0x84)]),
+    ("metz-connect/mr-ai8", "pt1000 as integer, °F", &[("code", 0x85), ("temperature_unit", 1)]),
+    ("metz-connect/mr-ai8", "resistance in steps of 100 ohms", &[("code", 0x44)]),
+    ("metz-connect/mr-ai8", "interpolation table, °F", &[("code", 0xF9), ("temperature_unit", 1)]),
+    ("metz-connect/mr-si4", "three decimals", &[("decimals", 3)]),
+];
+
+/// The message of a fresh device, and for each further state the components that differ from it.
+pub fn told(device: &Device) -> String {
+    let fresh = payload(device, &factory_settings(device));
+    let mut told = Map::new();
+    for (_, state, changes) in STATES.iter().filter(|(profile, _, _)| *profile == device.profile) {
+        let mut known = factory_settings(device);
+        for (name, raw) in *changes {
+            for (index, point) in device.points.iter().enumerate() {
+                if point.name == *name || point.name.ends_with(&format!("_{name}")) {
+                    known[index] = Some(*raw);
+                }
+            }
+        }
+        let changed = components(&payload(device, &known));
+        let before = components(&fresh);
+        let mut differing: Map<String, Value> =
+            changed.iter().filter(|(key, value)| before.get(*key) != Some(value)).map(cloned).collect();
+        for (key, _) in before.iter().filter(|(key, _)| !changed.contains_key(*key)) {
+            differing.insert(key.clone(), Value::Null);
+        }
+        told.insert(format!("then {state}"), differing.into());
+    }
+    told.insert("unknown selectors leave out".into(), waiting(device, &fresh).into());
+    let mut all = Map::new();
+    all.insert("fresh".into(), fresh);
+    all.extend(told);
+    format!("{:#}\n", Value::Object(all))
+}
+
+/// The keys that are not announced before anything has been read.
+fn waiting(device: &Device, fresh: &Value) -> Vec<Value> {
+    let at_first = components(&payload(device, &vec![None; device.points.len()]));
+    components(fresh)
+        .keys()
+        .filter(|key| !at_first.contains_key(*key))
+        .map(|key| key.clone().into())
+        .collect()
+}
+
+/// What each point holds that has a factory setting; a selector without one holds 0.
+fn factory_settings(device: &Device) -> Vec<Option<i128>> {
+    let selectors: Vec<usize> = device.points.iter().flat_map(|point| point.selectors()).collect();
+    (0..device.points.len())
+        .map(|index| device.points[index].default.or(selectors.contains(&index).then_some(0)))
+        .collect()
+}
+
+fn payload(device: &Device, known: &[Option<i128>]) -> Value {
+    let gateway = Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into() };
+    let settings = DeviceSettings {
+        name: "device".into(),
+        title: "Device".into(),
+        bus: 0,
+        unit: 1,
+        device: device.clone(),
+    };
+    let message = announcement(&gateway, &settings, "bus", known).message();
+    serde_json::from_str(&message.payload).expect("a discovery message is JSON")
+}
+
+fn components(payload: &Value) -> Map<String, Value> {
+    payload["components"].as_object().expect("a discovery message has components").clone()
+}
+
+fn cloned((key, value): (&String, &Value)) -> (String, Value) {
+    (key.clone(), value.clone())
+}

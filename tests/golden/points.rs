@@ -1,0 +1,154 @@
+//! The expanded points as a table for people, with the long lists below it.
+
+use busker::engine::device::{
+    Decimals, Device, Encoding, Form, Kind, Names, Point, Unit, Write, WriteFunction, WriteRule,
+};
+use busker::engine::value::Decimal;
+
+/// Lists of more names than this stand below the table, once for all points that share them.
+const NAMES_IN_LINE: usize = 3;
+
+/// A line a point: name, place, meaning, poll class, how it is written, what else.
+pub fn table(device: &Device) -> String {
+    let mut lists = Vec::new();
+    let rows: Vec<[String; 5]> = device.points.iter().map(|point| row(device, point, &mut lists)).collect();
+    let widths: Vec<usize> =
+        (0..4).map(|column| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0)).collect();
+    let mut text = String::new();
+    for row in &rows {
+        let mut line = String::new();
+        for (cell, width) in row.iter().zip(&widths) {
+            line.push_str(&format!("{cell:width$}  "));
+        }
+        line.push_str(&row[4]);
+        text.push_str(line.trim_end());
+        text.push('\n');
+    }
+    for (index, list) in lists.iter().enumerate() {
+        text.push_str(&format!("\n[{}]\n{list}", index + 1));
+    }
+    if !device.left_out.is_empty() {
+        text.push_str("\nleft out\n");
+    }
+    for left_out in &device.left_out {
+        text.push_str(&format!("{}: {}\n", left_out.span, left_out.reason));
+    }
+    text
+}
+
+fn row(device: &Device, point: &Point, lists: &mut Vec<String>) -> [String; 5] {
+    let place = match point.also {
+        Some(also) => format!("{}, {also}", point.at),
+        None => point.at.to_string(),
+    };
+    let meaning = match &point.encoding {
+        Encoding::Plain(form) => meaning(device, form, lists),
+        Encoding::Cases { by, cases } => {
+            let lines: String = cases
+                .iter()
+                .map(|case| {
+                    let form = case.form.as_ref();
+                    let form =
+                        form.map_or("no reading".into(), |form| meaning(device, form, &mut Vec::new()));
+                    format!("0x{:02X} {}: {form}\n", case.key, case.name)
+                })
+                .collect();
+            format!("by {}: {}", device.points[*by].name, reference(lists, lines))
+        }
+    };
+    let write = point.write.as_ref().map_or("read only".into(), |write| writing(point, write));
+    [point.name.clone(), place, meaning, point.poll.name().into(), format!("{write}{}", more(device, point))]
+}
+
+fn meaning(device: &Device, form: &Form, lists: &mut Vec<String>) -> String {
+    let mut words = vec![form.kind.name()];
+    if form.scale != Decimal::ONE {
+        words.push(format!("× {}", form.scale));
+    }
+    match form.decimals {
+        Some(Decimals::Fixed(decimals)) => words.push(format!("÷ 10^{decimals}")),
+        Some(Decimals::By(point)) => words.push(format!("÷ 10^{}", device.points[point].name)),
+        None => {}
+    }
+    if form.offset != Decimal::ZERO {
+        words.push(format!("+ {}", form.offset));
+    }
+    match &form.unit {
+        Unit::Fixed(unit) => words.push(unit.clone()),
+        Unit::By(point) => words.push(format!("unit of {}", device.points[*point].name)),
+        Unit::None => {}
+    }
+    if form.difference {
+        words.push("difference".into());
+    }
+    if let Some((min, max)) = form.range {
+        words.push(format!("{min}..{max}"));
+    }
+    let names = form.names.list();
+    if form.kind != Kind::Bool && !names.is_empty() {
+        let kind = if matches!(form.names, Names::All(_)) { "one of" } else { "or" };
+        if names.len() <= NAMES_IN_LINE {
+            let listed: Vec<String> = names.iter().map(|(raw, name)| format!("{raw} {name}")).collect();
+            words.push(format!("{kind} {}", listed.join(", ")));
+        } else {
+            let lines = names.iter().map(|(raw, name)| format!("0x{raw:02X} {name}\n")).collect();
+            words.push(format!("{kind} {}", reference(lists, lines)));
+        }
+    }
+    for (raw, reason) in &form.invalid {
+        words.push(format!("not {raw} ({reason})"));
+    }
+    words.join(" ")
+}
+
+fn reference(lists: &mut Vec<String>, list: String) -> String {
+    let index = lists.iter().position(|known| *known == list).unwrap_or_else(|| {
+        lists.push(list);
+        lists.len() - 1
+    });
+    format!("[{}]", index + 1)
+}
+
+fn writing(point: &Point, write: &Write) -> String {
+    let mut words = Vec::new();
+    words.push(match &write.rule {
+        WriteRule::Any => "write any".into(),
+        WriteRule::Range { min, max, step: None } => format!("write {min}..{max}"),
+        WriteRule::Range { min, max, step: Some(step) } => format!("write {min}..{max} step {step}"),
+        WriteRule::Names(names) => format!("write {}", names.join(", ")),
+        WriteRule::Press { word, self_clearing } => {
+            format!("press {word}{}", if *self_clearing { ", clears itself" } else { "" })
+        }
+    });
+    if write.at != point.at {
+        words.push(format!("at {}", write.at));
+    }
+    if let Some(function) = write.with {
+        words.push(format!("with function {}", WriteFunction::code(function)));
+    }
+    words.join(" ")
+}
+
+fn more(device: &Device, point: &Point) -> String {
+    let mut words = Vec::new();
+    if point.persistent {
+        words.push("EEPROM".to_string());
+    }
+    if point.read_clears {
+        words.push("reading clears it".into());
+    }
+    if let Some(default) = point.default {
+        words.push(format!("factory {default}"));
+    }
+    match point.re_read.as_slice() {
+        [] => {}
+        [one] => words.push(format!("then reads {}", device.points[*one].name)),
+        [first, .., last] => words.push(format!(
+            "then reads {} .. {} ({})",
+            device.points[*first].name,
+            device.points[*last].name,
+            point.re_read.len()
+        )),
+    }
+    words.iter().map(|word| format!("; {word}")).collect()
+}
