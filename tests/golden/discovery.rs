@@ -6,9 +6,12 @@ use busker::engine::settings::DeviceSettings;
 use busker::engine::topics::Topics;
 use serde_json::{Map, Value};
 
-/// States of selectors beside the one a device leaves the factory with: what they are called, and
-/// what which points hold (a point's name without a number means all its repetitions).
-const STATES: &[(&str, &str, &[(&str, i128)])] = &[
+/// A state of a profile's selectors: what it is called, and what which points hold. A name without
+/// its repetition (`code`) means all of them.
+type State = (&'static str, &'static str, &'static [(&'static str, i128)]);
+
+/// The states beside the one that a device leaves the factory with.
+const STATES: &[State] = &[
     ("metz-connect/mr-ai8", "pt1000 as float, °C", &[("code", 0x84)]),
     ("metz-connect/mr-ai8", "pt1000 as integer, °F", &[("code", 0x85), ("temperature_unit", 1)]),
     ("metz-connect/mr-ai8", "resistance in steps of 100 ohms", &[("code", 0x44)]),

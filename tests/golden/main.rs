@@ -11,6 +11,7 @@ mod readings;
 
 use std::fs;
 use std::path::PathBuf;
+use std::sync::LazyLock;
 
 use busker::engine::device::Device;
 use busker::engine::plan::{Cost, Read, Table, plan};
@@ -21,62 +22,62 @@ use busker::engine::time::Duration;
 #[test]
 fn the_points_are_those_of_the_manual() {
     for (id, device) in shipped() {
-        compare(&id, "points.txt", &points::table(&device));
+        compare(id, "points.txt", &points::table(device));
     }
 }
 
 #[test]
 fn the_plan_reads_them_in_the_fewest_safe_requests() {
     for (id, device) in shipped() {
-        compare(&id, "plan.txt", &Table { device: &device, reads: &usual_plan(&device) }.to_string());
+        compare(id, "plan.txt", &Table { device, reads: &usual_plan(device) }.to_string());
     }
 }
 
 #[test]
 fn the_readings_are_what_the_manual_says() {
     for (id, device) in shipped() {
-        let file = fs::read_to_string(place(&id, "readings.txt")).unwrap_or_default();
-        compare(&id, "readings.txt", &readings::answered(&device, &file));
+        let file = fs::read_to_string(place(id, "readings.txt")).unwrap_or_default();
+        compare(id, "readings.txt", &readings::answered(device, &file));
     }
 }
 
 #[test]
 fn every_point_and_every_case_of_every_profile_has_a_golden_reading() {
     for (id, device) in shipped() {
-        let file = fs::read_to_string(place(&id, "readings.txt")).unwrap_or_default();
-        assert_eq!(readings::without_a_reading(&device, &file), Vec::<String>::new(), "{id}");
+        let file = fs::read_to_string(place(id, "readings.txt")).unwrap_or_default();
+        assert_eq!(readings::without_a_reading(device, &file), Vec::<String>::new(), "{id}");
     }
 }
 
 #[test]
 fn home_assistant_is_told_what_a_person_wants_to_see() {
     for (id, device) in shipped() {
-        compare(&id, "discovery.json", &discovery::told(&device));
+        compare(id, "discovery.json", &discovery::told(device));
     }
 }
 
 #[test]
 fn there_are_no_goldens_of_devices_that_are_gone() {
-    let known: Vec<String> = shipped().into_iter().map(|(id, _)| id).collect();
+    let known: Vec<&String> = shipped().iter().map(|(id, _)| id).collect();
     for manufacturer in folders(&place("", "")) {
         for model in folders(&place(&manufacturer, "")) {
             let id = format!("{manufacturer}/{model}");
-            assert!(known.contains(&id), "tests/golden/{id} is of no shipped profile");
+            assert!(known.contains(&&id), "tests/golden/{id} is of no shipped profile");
         }
     }
 }
 
 /// Every shipped profile by its identifier.
-fn shipped() -> Vec<(String, Device)> {
-    let library = Library::shipped();
-    library
-        .ids()
-        .into_iter()
-        .map(|id| match library.load(id) {
+fn shipped() -> &'static [(String, Device)] {
+    static SHIPPED: LazyLock<Vec<(String, Device)>> = LazyLock::new(|| {
+        let library = Library::shipped();
+        let load = |id| match library.load(id) {
             Ok(device) => (id.to_string(), device),
             Err(faults) => panic!("{id}: {}", faults[0]),
-        })
-        .collect()
+        };
+        library.ids().into_iter().map(load).collect()
+    });
+    &SHIPPED
 }
 
 /// The plan on the line that these devices leave the factory with.
