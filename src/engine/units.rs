@@ -5,6 +5,7 @@
 //! `components/number/const.py`, `components/binary_sensor/__init__.py`).
 
 use crate::engine::device::{Form, Kind, Names, Platform, Point, WriteRule};
+use crate::engine::yaml::nearest;
 
 /// What a point can be in Home Assistant, read in this form; the first is what it is unless the
 /// profile says `as`. Never empty.
@@ -140,6 +141,9 @@ fn unknown_class<'a>(platform: Platform, class: &str, known: impl Iterator<Item 
     let known: Vec<&str> = known.collect();
     if known.is_empty() {
         return format!("a {platform} has no device class; leave `device_class` out");
+    }
+    if let Some(meant) = nearest(class, &known) {
+        return format!("`{class}` is no device class of a {platform}; did you mean `{meant}`?");
     }
     let expected = quoted(known.into_iter());
     format!("`{class}` is no device class of a {platform}; expected one of {expected}")

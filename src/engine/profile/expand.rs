@@ -30,7 +30,7 @@ pub struct Expanded<'f> {
 
 /// All points of `points`, in its order, repetitions one after the other.
 pub fn expand<'f>(points: &'f Map<Name, Point>, shared: &Shared, faults: &mut Faults) -> Vec<Expanded<'f>> {
-    let mut expansion = Expansion { shared, faults, expanded: Vec::new() };
+    let mut expansion = Expansion { shared, faults, expanded: Vec::new(), beyond: Vec::new() };
     for (name, point) in points.iter() {
         expansion.entry(name, point);
     }
@@ -41,6 +41,8 @@ struct Expansion<'a, 'f> {
     shared: &'a Shared,
     faults: &'a mut Faults,
     expanded: Vec<Expanded<'f>>,
+    /// Addresses of which some repetition lies outside; told once.
+    beyond: Vec<Place>,
 }
 
 /// Which repetition of what: its number in names, and how many come before it.
@@ -203,7 +205,7 @@ impl<'f> Expansion<'_, 'f> {
                 self.faults.add(
                     &width.place,
                     format!(
-                        "{} registers are too few for its types; expected at least {widest}",
+                        "a width of {} is too small for its type; expected at least {widest}",
                         width.value
                     ),
                 );
@@ -242,7 +244,7 @@ impl<'f> Expansion<'_, 'f> {
                 let moved = |bit: u8| u8::try_from(u32::from(bit) + up).unwrap_or(u8::MAX);
                 bits = Bits::new(moved(first.low()), moved(first.high()));
                 if bits.is_none() {
-                    self.faults.add(&address.place, format!("`{name}` would lie beyond bit 15 of its register; expected fewer repetitions or a smaller step"));
+                    self.lies_beyond(address, name, "bit 15 of its register");
                     return None;
                 }
                 0
@@ -251,13 +253,16 @@ impl<'f> Expansion<'_, 'f> {
         let first = u32::from(address.span.first()) + registers;
         let span = u16::try_from(first).ok().and_then(|first| Span::with_count(table, first, count));
         if span.is_none() {
-            self.faults.add(
-                &address.place,
-                format!(
-                    "`{name}` would lie beyond {table} 65535; expected a lower address, or fewer repetitions"
-                ),
-            );
+            self.lies_beyond(address, name, &format!("{table} 65535"));
         }
         span.map(|span| Address { span, bits })
+    }
+    fn lies_beyond(&mut self, address: &At<Address>, name: &str, end: &str) {
+        if !self.beyond.contains(&address.place) {
+            self.beyond.push(address.place.clone());
+            let message =
+                format!("`{name}` would lie beyond {end}; expected a lower place or fewer repetitions");
+            self.faults.add(&address.place, message);
+        }
     }
 }

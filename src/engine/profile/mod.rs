@@ -14,6 +14,8 @@ mod text;
 
 pub use library::Library;
 
+use std::sync::Arc;
+
 use serde_json::Value as Json;
 
 use crate::engine::device::Device;
@@ -26,30 +28,34 @@ impl Library {
     /// ([`Library::contains`]), who knows the place where it was asked for.
     pub fn load(&self, id: &str) -> Result<Device, Vec<Diagnostic>> {
         let mut faults = Faults::default();
-        let profile = self
-            .source(id, &mut faults)
-            .and_then(|source| parse(&source, &mut faults))
-            .and_then(|node| read::<Profile>(&node, &mut faults));
-        if let Some(profile) = &profile {
-            if profile.device.value != id {
-                let found = &profile.device.value;
-                let message =
-                    format!("`{found}` is not where the file is; expected `{id}`, its path without `.yaml`");
-                faults.add(&profile.device.place, message);
-            }
-        }
-        let device = profile.map(|profile| device_of(&profile, self, &mut faults));
+        let source = self.source(id, &mut faults);
+        let device = source.and_then(|source| self.device_in(&source, Some(id), &mut faults));
         faults.into_result(device)
     }
 
     /// The device in a file that need not be in the library; its shared files must be.
     pub fn check(&self, shown: &str, bytes: &[u8]) -> Result<Device, Vec<Diagnostic>> {
         let mut faults = Faults::default();
-        let device = Source::from_bytes(shown, bytes, &mut faults)
-            .and_then(|source| parse(&source, &mut faults))
-            .and_then(|node| read::<Profile>(&node, &mut faults))
-            .map(|profile| device_of(&profile, self, &mut faults));
+        let source = Source::from_bytes(shown, bytes, &mut faults);
+        let device = source.and_then(|source| self.device_in(&source, None, &mut faults));
         faults.into_result(device)
+    }
+
+    fn device_in(&self, source: &Arc<Source>, id: Option<&str>, faults: &mut Faults) -> Option<Device> {
+        let node = parse(source, faults)?;
+        let Some(profile) = read::<Profile>(&node, faults) else {
+            // Something of the head is wrong. The points are checked all the same, so that all
+            // faults are told at once.
+            load_inline(node.get("points")?, node.get("wire"), node.get("home_assistant"), self, faults);
+            return None;
+        };
+        if let Some(id) = id.filter(|id| profile.device.value != *id) {
+            let found = &profile.device.value;
+            let message =
+                format!("`{found}` is not where the file is; expected `{id}`, its path without `.yaml`");
+            faults.add(&profile.device.place, message);
+        }
+        Some(device_of(&profile, self, faults))
     }
 }
 
@@ -64,14 +70,8 @@ pub fn load_inline(
     library: &Library,
     faults: &mut Faults,
 ) -> Option<Device> {
-    let wire = match wire {
-        Some(node) => Some(read(node, faults)?),
-        None => None,
-    };
-    let home_assistant = match home_assistant {
-        Some(node) => read(node, faults)?,
-        None => Map::default(),
-    };
+    let wire = wire.and_then(|node| read(node, faults));
+    let home_assistant = home_assistant.and_then(|node| read(node, faults)).unwrap_or_default();
     let profile = Profile {
         place: points.named_at().clone(),
         device: At::nowhere("inline".into()),

@@ -399,7 +399,7 @@ fn write_of(expanded: &Expanded<'_>) -> Option<Write> {
             Writable::Range { range, step } => {
                 WriteRule::Range { min: range.min, max: range.max, step: *step }
             }
-            Writable::Names(names) => WriteRule::Names(names.clone()),
+            Writable::Names(names) => WriteRule::Names(names.iter().map(|name| name.value.clone()).collect()),
         },
         (None, None) => return None,
     };
@@ -432,12 +432,12 @@ fn kind_of(expanded: &Expanded<'_>, form: &Form, names: &[(i128, String)]) -> Ki
         Some(bits) => bits.width() == 1,
         None => expanded.at.span.table().is_bits() && expanded.at.span.count() == 1,
     };
-    let is_number = is_number(expanded, form);
-    if (is_off_and_on || one_bit && names.is_empty()) && !is_number { Kind::Bool } else { Kind::U16 }
+    let is_flag = if names.is_empty() { one_bit } else { is_off_and_on && !is_number(expanded, form) };
+    if is_flag { Kind::Bool } else { Kind::U16 }
 }
 
 /// 0x8000 of a signed register is -32768.
-fn as_decoded(kind: Kind, word: i128) -> i128 {
+pub fn as_decoded(kind: Kind, word: i128) -> i128 {
     match kind.integer_range() {
         Some((min, max)) if min < 0 && word > max && word <= max - min => word + 2 * min,
         _ => word,

@@ -6,7 +6,7 @@ use crate::choices;
 use crate::engine::address::{Address, Bits, Span, Table};
 use crate::engine::device::{Category, Kind, Order, Platform, Poll, WriteFunction};
 use crate::engine::value::Decimal;
-use crate::engine::yaml::{Content, Definitions, Faults, Node, Read, Scalar};
+use crate::engine::yaml::{At, Content, Definitions, Faults, Node, Read, Scalar};
 
 choices! { "a byte order", Order {
     "abcd" => Order::Abcd, "cdab" => Order::Cdab, "badc" => Order::Badc, "dcba" => Order::Dcba,
@@ -251,11 +251,11 @@ impl Scalar for Range {
 }
 
 /// What may be written.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub enum Writable {
     Any,
     Range { range: Range, step: Option<Decimal> },
-    Names(Vec<String>),
+    Names(Vec<At<String>>),
 }
 
 impl Read for Writable {

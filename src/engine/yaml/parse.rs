@@ -252,6 +252,11 @@ impl Builder<'_> {
         self.source.place(byte(span.start.index()), byte(span.end.index()))
     }
 
+    /// Where the innermost list or map began.
+    fn begun(&self) -> String {
+        self.open.last().map_or(String::new(), |open| format!(" that begins in line {}", open.place.line()))
+    }
+
     /// The parser's own errors, with what to do about the common ones.
     fn fault_of_yaml(&self, error: &ScanError) -> Fault {
         let place = self.place(Span::empty(*error.marker()));
@@ -264,9 +269,9 @@ impl Builder<'_> {
         } else if says("mapping values are not allowed") || says("illegal placement of ':'") {
             "a `:` where no key can stand; indent the line like its neighbours, or put a text with `: ` in quotes".into()
         } else if says("expected ',' or ']'") {
-            "this list is not closed; expected `,` or `]`".into()
+            format!("the list{} is not closed; expected `,` or `]`", self.begun())
         } else if says("expected ',' or '}'") {
-            "this map is not closed; expected `,` or `}`".into()
+            format!("the map{} is not closed; expected `,` or `}}`", self.begun())
         } else if says("quoted scalar") && says("end of stream") {
             "a quote is not closed; expected it before the end of the file".into()
         } else if says("simple key expect") || says("did not find expected key") {

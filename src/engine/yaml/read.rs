@@ -109,7 +109,10 @@ impl<T> Deref for At<T> {
 
 impl<T: Read> Read for At<T> {
     fn read(node: &Node, faults: &mut Faults) -> Option<At<T>> {
-        Some(At { value: T::read(node, faults)?, place: node.place.clone() })
+        // Of a map or a list the key says better which one is meant.
+        let place =
+            if matches!(node.content, Content::Scalar { .. }) { &node.place } else { node.named_at() };
+        Some(At { value: T::read(node, faults)?, place: place.clone() })
     }
 
     fn schema(definitions: &mut Definitions) -> Json {
