@@ -17,6 +17,12 @@ use crate::edge::metrics;
 use crate::edge::reports::Reporter;
 use crate::engine::health::Status;
 
+/// An address that is taken, but not yet answered on.
+pub struct Bound {
+    listener: TcpListener,
+    address: SocketAddr,
+}
+
 /// The running server.
 pub struct Http {
     address: SocketAddr,
@@ -24,11 +30,16 @@ pub struct Http {
 }
 
 impl Http {
-    /// Listens on `listen`, as `127.0.0.1:8485`; port 0 takes a free one.
-    pub async fn start(listen: &str, reporter: Arc<Reporter>, clock: Clock) -> anyhow::Result<Http> {
+    /// Takes the address `listen`, as `127.0.0.1:8485`; port 0 takes a free one.
+    pub async fn bind(listen: &str) -> anyhow::Result<Bound> {
         let listener =
-            TcpListener::bind(listen).await.with_context(|| format!("cannot listen on {listen}"))?;
+            TcpListener::bind(listen).await.with_context(|| format!("HTTP cannot listen on {listen}"))?;
         let address = listener.local_addr().context("the HTTP listener has no address")?;
+        Ok(Bound { listener, address })
+    }
+
+    /// Answers from now on. Only within a runtime.
+    pub fn serve(bound: Bound, reporter: Arc<Reporter>, clock: Clock) -> Http {
         let router = Router::new()
             .route("/health", get(health))
             .route("/metrics", get(metrics))
@@ -36,11 +47,11 @@ impl Http {
             .route("/api/buses", get(buses))
             .with_state(Shared { reporter, clock });
         let server = tokio::spawn(async move {
-            if let Err(error) = axum::serve(listener, router).await {
+            if let Err(error) = axum::serve(bound.listener, router).await {
                 tracing::warn!("the HTTP server has ended: {error}");
             }
         });
-        Ok(Http { address, server })
+        Http { address: bound.address, server }
     }
 
     pub fn address(&self) -> SocketAddr {

@@ -1,11 +1,14 @@
 //! The edge does: everything that waits, opens and asks the time. It decides nothing.
 
+pub mod app;
 pub mod bell;
 pub mod bus_thread;
 pub mod clock;
+pub mod files;
 pub mod guarded_link;
 pub mod http;
 pub mod link;
 pub mod metrics;
 pub mod mqtt;
 pub mod reports;
+pub mod shutdown;

@@ -117,6 +117,7 @@ impl Broker {
             mailbox: mailbox.clone(),
             state: state.clone(),
             connected: false,
+            told_up: None,
             subscribed: false,
             tell,
         };
@@ -237,6 +238,8 @@ struct Feeder<Tell> {
     mailbox: Arc<Mailbox>,
     state: Arc<Mutex<BrokerReport>>,
     connected: bool,
+    /// What was last told of the connection.
+    told_up: Option<bool>,
     subscribed: bool,
     tell: Tell,
 }
@@ -280,6 +283,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 drop(state);
                 (self.connected, self.subscribed) = (true, false);
                 self.mailbox.outbox().connected();
+                self.told_up = Some(true);
                 (self.tell)(News::Up);
             }
             Seen::Down(reason) => {
@@ -291,7 +295,9 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 }
                 state.reason = Some(reason);
                 drop(state);
-                if std::mem::take(&mut self.connected) {
+                self.connected = false;
+                if self.told_up != Some(false) {
+                    self.told_up = Some(false);
                     (self.tell)(News::Down);
                 }
             }

@@ -12,8 +12,8 @@ use crate::engine::time::Duration;
 /// A bus thread answers between two requests on the wire. One that needs longer is stuck.
 const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 
-/// Passes a question on to a bus, which answers through the channel.
-pub type Ask = Box<dyn Fn(oneshot::Sender<BusReport>) + Send + Sync>;
+/// Asks a bus, which answers through the channel.
+pub type Ask = Box<dyn Fn() -> oneshot::Receiver<BusReport> + Send + Sync>;
 
 /// Knows how to reach everything that has something to report.
 pub struct Reporter {
@@ -32,15 +32,7 @@ impl Reporter {
     /// The gateway as it is now; takes a second if a bus is stuck, and no longer if several are.
     pub async fn report(&self) -> GatewayReport {
         let deadline = Instant::now() + ANSWER_WITHIN;
-        let answers: Vec<oneshot::Receiver<BusReport>> = self
-            .buses
-            .iter()
-            .map(|ask| {
-                let (answer, receiver) = oneshot::channel();
-                ask(answer);
-                receiver
-            })
-            .collect();
+        let answers: Vec<oneshot::Receiver<BusReport>> = self.buses.iter().map(|ask| ask()).collect();
         let mut buses = Vec::new();
         for (index, answer) in answers.into_iter().enumerate() {
             let answer = timeout_at(deadline, answer).await.ok().and_then(Result::ok);

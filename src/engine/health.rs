@@ -1,8 +1,11 @@
 //! What a bus and its devices say of themselves: counters, states and reasons.
 
+use std::collections::BTreeSet;
+
 use serde_json::{Map, Value, json};
 
 use crate::engine::modbus::{Discarded, RequestError};
+use crate::engine::settings::Settings;
 use crate::engine::time::{Duration, Time};
 
 /// What happened on the wire, each error counted as what it was.
@@ -112,6 +115,33 @@ pub struct PointReport {
     /// Why it is `None`.
     pub reason: Option<String>,
     pub read_at: Option<Time>,
+}
+
+/// `bridge/info`: what the gateway is and what it was told to do, without secrets.
+pub fn info_json(settings: &Settings) -> Value {
+    let buses: Map<String, Value> =
+        settings.buses.iter().map(|bus| (bus.name.clone(), bus.link.to_string().into())).collect();
+    let devices: Map<String, Value> = settings
+        .devices
+        .iter()
+        .map(|device| {
+            let about = json!({
+                "name": device.title,
+                "profile": device.device.profile,
+                "bus": settings.buses[device.bus].name,
+                "unit": device.unit,
+            });
+            (device.name.clone(), about)
+        })
+        .collect();
+    let profiles: BTreeSet<&str> =
+        settings.devices.iter().map(|device| device.device.profile.as_str()).collect();
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "buses": buses,
+        "devices": devices,
+        "profiles": profiles,
+    })
 }
 
 /// The whole gateway as it is now.

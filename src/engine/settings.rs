@@ -88,6 +88,17 @@ pub enum Link {
     RtuOverTcp { host: String, port: u16, line: Line },
 }
 
+impl std::fmt::Display for Link {
+    /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Link::Serial { path, .. } => write!(f, "serial {path}"),
+            Link::Tcp { host, port } => write!(f, "tcp {host}:{port}"),
+            Link::RtuOverTcp { host, port, .. } => write!(f, "rtu over tcp {host}:{port}"),
+        }
+    }
+}
+
 /// The characters on a serial line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Line {

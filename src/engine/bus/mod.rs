@@ -226,11 +226,7 @@ impl Bus {
         };
         BusReport {
             name: self.name.clone(),
-            link: match &self.link {
-                Link::Serial { path, .. } => format!("serial {path}"),
-                Link::Tcp { host, port } => format!("tcp {host}:{port}"),
-                Link::RtuOverTcp { host, port, .. } => format!("rtu over tcp {host}:{port}"),
-            },
+            link: self.link.to_string(),
             up: self.link_state == LinkState::Up,
             reason,
             counters: self.counters,

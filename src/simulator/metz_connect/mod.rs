@@ -3,11 +3,8 @@
 //!
 //! [`MetzConnect`] is that common part around a [`Module`], which is one device's own chapter.
 
-mod channel;
-pub mod mr_ai8;
 pub mod mr_do4;
 pub mod mr_si4;
-mod sensors;
 
 use crate::engine::time::Time;
 use crate::simulator::device::{
