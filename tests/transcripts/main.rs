@@ -5,6 +5,7 @@
 
 mod devices;
 mod play;
+mod properties;
 
 use std::path::PathBuf;
 

@@ -1,0 +1,188 @@
+//! Whatever happens to a bus, in whatever order: the promises that hold always.
+
+use busker::engine::address::Span;
+use busker::engine::bus::{Action, Bus, Command, Event};
+use busker::engine::modbus::{Answer, Call, Discarded, Identification, Reply, Request, RequestError};
+use busker::engine::time::{Duration, Time};
+use proptest::prelude::*;
+
+use crate::devices;
+
+const DEVICES: &str = "device relays 1 relays\ndevice meter 2 selectable\ndevice board 3 clamping\n\
+    device holes 4 holes\ndevice cellar 5 identified\ndiscovery\n";
+const COMMANDS: [(&str, &str, &str); 9] = [
+    ("relays", "relay_1", "ON"),
+    ("relays", "relay_1_default", "ON"),
+    ("relays", "watchdog", "12.5"),
+    ("relays", "reset", "PRESS"),
+    ("meter", "mode", "voltage"),
+    ("meter", "value", "3"),
+    ("board", "order", "automatic"),
+    ("board", "level", "nonsense"),
+    ("cellar", "level", "1"),
+];
+
+#[derive(Clone, Debug)]
+enum Happening {
+    /// The request in flight ends so; without one, nothing.
+    Ends(End),
+    Command(usize),
+    LinkDown,
+    LinkUp,
+    Time(u16),
+}
+
+#[derive(Clone, Debug)]
+enum End {
+    Words(u16),
+    Refused(u8),
+    Silence,
+    Checksum,
+}
+
+fn happening() -> impl Strategy<Value = Happening> {
+    prop_oneof![
+        8 => (0u16..4).prop_map(|word| Happening::Ends(End::Words(word))),
+        2 => any::<u16>().prop_map(|word| Happening::Ends(End::Words(word))),
+        1 => (1u8..7).prop_map(|code| Happening::Ends(End::Refused(code))),
+        1 => Just(Happening::Ends(End::Silence)),
+        1 => Just(Happening::Ends(End::Checksum)),
+        3 => (0..COMMANDS.len()).prop_map(Happening::Command),
+        1 => Just(Happening::LinkDown),
+        2 => Just(Happening::LinkUp),
+        4 => (0u16..2000).prop_map(Happening::Time),
+    ]
+}
+
+fn answer(request: &Request, word: u16) -> Answer {
+    match request.call {
+        Call::Read(span) if span.table().is_bits() => Answer::Bits(vec![word & 1 == 1; count(span)]),
+        Call::Read(span) => Answer::Words(vec![word; count(span)]),
+        Call::ReadIdentification { .. } => {
+            let product = if word == 0 { "L2" } else { "L1" };
+            let objects = vec![(0, "ACME".to_string()), (1, product.to_string())];
+            Answer::Identification(Identification { conformity: 1, next: None, objects })
+        }
+        _ => Answer::Written,
+    }
+}
+
+fn count(span: Span) -> usize {
+    span.count() as usize
+}
+
+/// A bus and what an observer has seen of it.
+struct Observed {
+    bus: Bus,
+    now: Time,
+    in_flight: Option<Request>,
+    outcomes: usize,
+    /// Commands sent to points that exist.
+    commands: usize,
+}
+
+impl Observed {
+    fn take_actions(&mut self) {
+        while let Some(action) = self.bus.next_action() {
+            match action {
+                Action::Send { request, .. } => {
+                    assert!(self.in_flight.is_none(), "two requests in flight");
+                    self.in_flight = Some(request);
+                }
+                Action::Publish(message) if message.topic.ends_with("/outcome") => self.outcomes += 1,
+                _ => {}
+            }
+        }
+    }
+
+    fn handle(&mut self, event: Event) {
+        self.bus.handle(self.now, event);
+        self.take_actions();
+    }
+
+    fn end(&mut self, end: &End) {
+        let Some(request) = self.in_flight.take() else { return };
+        let result = match end {
+            End::Words(word) => Ok(answer(&request, *word)),
+            End::Refused(code) => Err(RequestError::Exception(*code)),
+            End::Silence => Err(RequestError::Timeout),
+            End::Checksum => Err(RequestError::Checksum),
+        };
+        let (sent_at, heard) = (self.now, Some(self.now));
+        let discarded = Discarded::default();
+        self.handle(Event::Reply(Reply {
+            result,
+            sent_at,
+            first_byte_at: heard,
+            last_byte_at: heard,
+            discarded,
+        }));
+    }
+
+    fn play(&mut self, happening: &Happening) {
+        match happening {
+            Happening::Ends(end) => self.end(end),
+            Happening::Command(index) => {
+                let (device, point, payload) = COMMANDS[*index];
+                self.commands += 1;
+                self.handle(Event::Command(Command {
+                    device: device.into(),
+                    point: point.into(),
+                    payload: payload.into(),
+                    retained: false,
+                }));
+            }
+            Happening::LinkDown => {
+                self.in_flight = None;
+                self.handle(Event::LinkDown("pulled".into()));
+            }
+            Happening::LinkUp => {
+                if self.in_flight.is_none() {
+                    self.handle(Event::LinkUp);
+                }
+            }
+            Happening::Time(millis) => {
+                let until = self.now + Duration::from_millis(u64::from(*millis));
+                while let Some(wake_at) = self.bus.wake_at().filter(|wake_at| *wake_at <= until) {
+                    let before = self.now;
+                    self.now = self.now.max(wake_at);
+                    self.handle(Event::Wake);
+                    let again = self.bus.wake_at();
+                    assert!(
+                        self.in_flight.is_some()
+                            || again.is_none_or(|again| again > self.now || self.now > before),
+                        "woken for nothing at {}",
+                        self.now
+                    );
+                    if self.in_flight.is_some() {
+                        break;
+                    }
+                }
+                self.now = until.max(self.now);
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(300))]
+
+    #[test]
+    fn each_command_has_one_outcome_and_one_request_is_in_flight(
+        happenings in prop::collection::vec(happening(), 1..300),
+    ) {
+        let bus = Bus::new(Time::default(), &devices::settings(DEVICES), 0);
+        let mut observed = Observed { bus, now: Time::default(), in_flight: None, outcomes: 0, commands: 0 };
+        observed.take_actions();
+        observed.play(&Happening::LinkUp);
+        for happening in &happenings {
+            observed.play(happening);
+        }
+        observed.handle(Event::Shutdown);
+        for _ in 0..10 {
+            observed.end(&End::Silence);
+        }
+        prop_assert!(observed.bus.is_finished());
+        prop_assert_eq!(observed.outcomes, observed.commands);
+    }
+}
