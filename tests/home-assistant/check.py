@@ -72,19 +72,19 @@ def main() -> None:
         folder = pathlib.Path(folder)
         broker = Broker(folder, ending)
         modbus_port = free_port()
-        start(ending, BUSKER, "simulate", *(f"{profile}@{unit}" for _, profile, unit in DEVICES),
-              "--tcp", f"127.0.0.1:{modbus_port}")
+        simulator = start(ending, BUSKER, "simulate", *(f"{profile}@{unit}" for _, profile, unit in DEVICES),
+                          "--tcp", f"127.0.0.1:{modbus_port}")
         wait_for_port(modbus_port)
         configuration = folder / "busker.yaml"
         configuration.write_text(configuration_text(folder, broker.port, modbus_port))
         gateway = start(ending, BUSKER, "run", "--config", str(configuration))
         home = Home(folder / "home-assistant", broker.port, ending)
         print(f"Home Assistant {home.version}", flush=True)
-        check_all(home, broker, gateway, lambda unit: Device(modbus_port, unit))
+        check_all(home, broker, gateway, Plant(simulator, modbus_port))
     print("all as it should be")
 
 
-def check_all(home, broker, gateway, device) -> None:
+def check_all(home, broker, gateway, plant) -> None:
     step("the expected entities are there, each as it should be")
     home.wait(EXPECTED)
     entities = home.ask("entities")
@@ -105,46 +105,56 @@ def check_all(home, broker, gateway, device) -> None:
     step("a switch switches the relay, and shows what the device says")
     home.call("switch.turn_on", "busker_relays_relay_2")
     home.wait({"busker_relays_relay_2": {"state": "on"}, "busker_relays_relay_1": {"state": "off"}})
-    same(device(1).read(1, 0, 4), [0, 1, 0, 0], "the coils of the relays")
+    same(plant.unit(1).read(1, 0, 4), [0, 1, 0, 0], "the coils of the relays")
     home.call("switch.turn_off", "busker_relays_relay_2")
     home.wait({"busker_relays_relay_2": {"state": "off"}})
-    same(device(1).read(1, 0, 4), [0, 0, 0, 0], "the coils of the relays")
+    same(plant.unit(1).read(1, 0, 4), [0, 0, 0, 0], "the coils of the relays")
 
-    step("a change at the device itself is shown")
-    device(1).write_coil(2, True)
-    home.wait({"busker_relays_relay_3": {"state": "on"}})
+    step("what happens at the devices is shown: a hand switch, a voltage, pulses")
+    plant.do("unit 1 relay 4 hand on")
+    plant.do("unit 2 input 1 volts 2.5")
+    plant.do("unit 3 input 1 counter 12345")
+    home.wait({
+        "busker_relays_relay_4": {"state": "on"},
+        "busker_relays_relay_4_hand": {"state": "on"},
+        "busker_inputs_channel_1_value_v": {"state": "2.5"},
+        # One pulse per unit and one decimal, as the device leaves the factory.
+        "busker_meters_meter_1_reading": {"state": "12345.0"},
+    })
 
     step("a number is set")
     home.call("number.set_value", "busker_relays_watchdog", value=600.5)
     home.wait({"busker_relays_watchdog": {"state": "600.5"}})
-    same(device(1).read(3, 66, 1), [60050], "the watchdog's register")
+    same(plant.unit(1).read(3, 66, 1), [60050], "the watchdog's register")
 
     step("a value outside the limits is refused by Home Assistant and reaches no device")
     home.call_fails("number.set_value", "busker_relays_watchdog", value=700)
-    same(device(1).read(3, 66, 1), [60050], "the watchdog's register")
+    same(plant.unit(1).read(3, 66, 1), [60050], "the watchdog's register")
 
     step("a selected order switches the relay, and a pressed button restarts the board")
     home.call("select.select_option", "busker_board_relay_5_order", option="ON")
     home.wait({"busker_board_relay_5_order": {"state": "ON"}, "busker_board_relay_5_state": {"state": "on"}})
-    same(device(4).read(3, 5, 1), [1], "the board's order register")
+    same(plant.unit(4).read(3, 5, 1), [1], "the board's order register")
     home.call("button.press", "busker_board_restart")
     home.wait({"busker_board_relay_5_order": {"state": "automatic"}, "busker_board_restart": {"known": True}})
-    same(device(4).read(3, 5, 1), [11111], "the board's order register")
+    same(plant.unit(4).read(3, 5, 1), [11111], "the board's order register")
 
     step("another sensor makes another entity of the input")
+    plant.do("unit 2 input 3 ohms 1077.9")
     home.call("select.select_option", "busker_inputs_channel_3_code", option="pt1000_integer")
-    celsius = facts("sensor", unit="°C", device_class="temperature", state_class="measurement")
+    # A PT1000 of 1077.9 ohms is at 20 °C (IEC 60751).
+    celsius = facts("sensor", unit="°C", device_class="temperature", state_class="measurement", state="20.0")
     home.wait({
         "busker_inputs_channel_3_code": {"state": "pt1000_integer"},
         "busker_inputs_channel_3_value_c": celsius,
         "busker_inputs_channel_3_value_v": {"exists": False},
         "busker_inputs_channel_4_value_v": facts("sensor", unit="V"),
     })
-    same(device(2).read(3, 18, 1), [0x85], "the input's configuration register")
+    same(plant.unit(2).read(3, 18, 1), [0x85], "the input's configuration register")
     home.call("select.select_option", "busker_inputs_temperature_unit", option="°F")
     home.wait({
         "busker_inputs_temperature_unit": {"state": "°F"},
-        "busker_inputs_channel_3_value_f": {"exists": True, "known": True},
+        "busker_inputs_channel_3_value_f": {"exists": True, "unit": "°C", "state": "20.0"},
         "busker_inputs_channel_3_value_c": {"exists": False},
     })
     home.call("select.select_option", "busker_inputs_temperature_unit", option="°C")
@@ -285,8 +295,23 @@ class Broker:
         return found
 
 
-class Device:
-    """One unit behind the simulator's Modbus TCP port."""
+class Plant:
+    """The simulated devices: what happens to them, and what they hold."""
+
+    def __init__(self, simulator: subprocess.Popen, port: int) -> None:
+        self.simulator, self.port = simulator, port
+
+    def do(self, command: str) -> None:
+        """As `busker simulate --help` lists them."""
+        self.simulator.stdin.write(command + "\n")
+        self.simulator.stdin.flush()
+
+    def unit(self, unit: int) -> "Unit":
+        return Unit(self.port, unit)
+
+
+class Unit:
+    """One device behind the simulator's Modbus TCP port."""
 
     def __init__(self, port: int, unit: int) -> None:
         self.port, self.unit = port, unit
@@ -306,9 +331,6 @@ class Device:
             return [data[bit // 8] >> (bit % 8) & 1 for bit in range(count)]
         return list(struct.unpack(f">{count}H", data))
 
-    def write_coil(self, at: int, on: bool) -> None:
-        self.ask(5, struct.pack(">HH", at, 0xFF00 if on else 0))
-
 
 class Fault(Exception):
     """Something is not as it should be."""
@@ -327,7 +349,8 @@ def same(found, wanted, what: str) -> None:
 
 
 def start(ending: contextlib.ExitStack, *command: str, quiet: bool = False) -> subprocess.Popen:
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL if quiet else None, stdout=subprocess.DEVNULL)
+    nowhere = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere if quiet else None, text=True)
     ending.callback(process.kill)
     return process
 
