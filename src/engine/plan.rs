@@ -3,7 +3,7 @@
 //! Within one poll class and one table the points are sorted by address, and a dynamic programme
 //! finds where to cut: a second request costs its frames, the silence and the device's turnaround;
 //! reading over a gap costs its bytes. No cut and no read breaks a limit, leaves a readable range,
-//! touches a forbidden span, splits a value, or reads over a gap that the device once refused.
+//! touches a forbidden span, splits a value, or holds what the device once refused to give in one.
 
 use std::fmt;
 
@@ -24,6 +24,27 @@ pub struct Read {
 }
 
 impl Read {
+    /// What to hold against this read when the device has refused it. Read over gaps, each gap is
+    /// suspect; without gaps the span is halved, so that a few refusals find the one point to blame.
+    /// Empty for a single value: there is nothing to divide.
+    pub fn refused(&self) -> Vec<Span> {
+        let across = |before: Address, after: Address| {
+            Span::new(self.span.table(), before.span.last(), after.span.first().max(before.span.last()))
+        };
+        let neighbours = || self.points.windows(2).map(|pair| (pair[0].1, pair[1].1));
+        let distinct = |(before, after): &(Address, Address)| before.span.last() < after.span.first();
+        let over_gaps: Vec<Span> = neighbours()
+            .filter(|(before, after)| u32::from(before.span.last()) + 1 < u32::from(after.span.first()))
+            .filter_map(|(before, after)| across(before, after))
+            .collect();
+        if !over_gaps.is_empty() {
+            return over_gaps;
+        }
+        let boundaries: Vec<(Address, Address)> = neighbours().filter(distinct).collect();
+        let middle = boundaries.get(boundaries.len() / 2);
+        middle.and_then(|(before, after)| across(*before, *after)).into_iter().collect()
+    }
+
     /// The runs of addresses inside the span that no point needs.
     pub fn gaps(&self) -> Vec<Span> {
         let mut gaps = Vec::new();
@@ -74,7 +95,8 @@ impl Cost {
 }
 
 /// The cheapest safe reads of `device`, by poll class, table and address. `refused` are spans that
-/// the device has answered with an exception: no read goes over one that no point needs.
+/// the device has refused to give in one answer ([`Read::refused`]): no read of several points
+/// contains one.
 pub fn plan(device: &Device, cost: Cost, refused: &[Span]) -> Vec<Read> {
     let mut places: Vec<Address> = device.points.iter().map(|point| point.at).collect();
     let mut best = plan_at(device, &places, cost, refused);
@@ -204,7 +226,7 @@ fn may_be_one_read(device: &Device, read: &Read, refused: &[Span]) -> bool {
         && !wire.forbidden.iter().any(|forbidden| forbidden.span.overlaps(read.span))
         && !device.points.iter().any(|point| point.read_clears && point.at.span.overlaps(read.span))
         && wire.limits.gap.is_none_or(|widest| gaps.iter().all(|gap| gap.count() <= u32::from(widest)))
-        && !gaps.iter().any(|gap| refused.iter().any(|span| span.overlaps(*gap)))
+        && !refused.iter().any(|span| read.span.contains(*span))
 }
 
 fn limit(device: &Device, span: Span) -> u32 {

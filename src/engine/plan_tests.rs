@@ -50,7 +50,26 @@ fn near_points_share_a_read_and_far_ones_do_not() {
 fn a_gap_that_was_refused_is_not_bridged_again() {
     let device = device(&[(0, 1), (2, 1), (4, 1)], |_| {});
     check(&device, &[], &["input 0..4"]);
-    check(&device, &[Span::single(RegisterTable::Input, 1)], &["input 0", "input 2..4"]);
+    let refused = plan(&device, cost(), &[])[0].refused();
+    assert_eq!(refused, [span(RegisterTable::Input, 0, 2), span(RegisterTable::Input, 2, 4)]);
+    check(&device, &refused[..1], &["input 0", "input 2..4"]);
+}
+
+#[test]
+fn a_refused_read_is_halved_until_the_one_to_blame_is_alone() {
+    let device = device(&(0..16).map(|first| (first, 1)).collect::<Vec<_>>(), |_| {});
+    let mut refused = Vec::new();
+    let mut refusals = 0;
+    // Register 11 does not exist: whatever holds it is refused.
+    while let Some(read) = plan(&device, cost(), &refused)
+        .into_iter()
+        .find(|read| read.points.len() > 1 && read.span.contains(Span::single(RegisterTable::Input, 11)))
+    {
+        refused.extend(read.refused());
+        refusals += 1;
+    }
+    check(&device, &refused, &["input 0..7", "input 8..9", "input 10", "input 11", "input 12..15"]);
+    assert_eq!(refusals, 4);
 }
 
 #[test]

@@ -68,6 +68,11 @@ fn device(kind: &str) -> Device {
             point("first", register(Table::Input, 0, 1), Poll::Fast),
             point("third", register(Table::Input, 2, 1), Poll::Fast),
         ]),
+        "row" => {
+            let names = ["zero", "one", "two", "three"];
+            let at = |index: usize| register(Table::Input, index as u16, 1);
+            with(names.iter().enumerate().map(|(index, name)| point(name, at(index), Poll::Fast)).collect())
+        }
         "relays" => relays(),
         "selectable" => selectable(),
         "identified" => {

@@ -32,7 +32,7 @@ pub(super) struct DeviceState {
     cost: Cost,
     values: Values,
     polls: Polls,
-    /// Gaps that the device has refused to be read over.
+    /// What the device has refused to give in one answer.
     refused: Vec<crate::engine::address::Span>,
     presence: Presence,
     /// Requests without an answer since the last answer.
@@ -354,14 +354,14 @@ impl DeviceState {
     /// The device answered a read with an exception: it is there, but will not tell this.
     fn refused(&mut self, now: Time, index: usize, code: u8, context: &mut Context) {
         let read = self.polls.read(index).clone();
-        let gaps = read.gaps();
         if matches!(code, 5 | 6) {
             self.polls.want_again(index);
             self.polls.pause(index, now + PAUSE_BUSY);
             return;
         }
-        if code == 2 && !gaps.is_empty() {
-            self.refused.extend(gaps);
+        let suspects = if code == 2 { read.refused() } else { Vec::new() };
+        if !suspects.is_empty() {
+            self.refused.extend(suspects);
             let reads = plan::plan(&self.settings.device, self.cost, &self.refused);
             let values = &self.values;
             self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
