@@ -11,6 +11,8 @@
 //! ends the process by itself and never prints its own failure: it returns a [`Failure`], and
 //! `main.rs` prints it and chooses the exit code.
 
+mod check;
+pub mod configuration;
 pub mod output;
 mod simulate;
 
@@ -34,6 +36,7 @@ macro_rules! verbs {
 }
 
 verbs! {
+    check Check,
     simulate Simulate,
 }
 

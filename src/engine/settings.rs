@@ -1,6 +1,7 @@
 //! What the owner wants: broker, buses, devices. Resolved and checked; the file's shape is
 //! `configuration::file`.
 
+use std::fmt;
 use std::path::PathBuf;
 
 use crate::engine::device::Device;
@@ -30,9 +31,9 @@ pub struct Mqtt {
     pub base_topic: String,
 }
 
-impl std::fmt::Debug for Mqtt {
+impl fmt::Debug for Mqtt {
     /// Tells everything but the password.
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Mqtt({}:{}, base topic {})", self.host, self.port, self.base_topic)
     }
 }
@@ -88,9 +89,9 @@ pub enum Link {
     RtuOverTcp { host: String, port: u16, line: Line },
 }
 
-impl std::fmt::Display for Link {
-    /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Display for Link {
+    /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`, `rtu over tcp 192.168.1.21:4196`
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Link::Serial { path, .. } => write!(f, "serial {path}"),
             Link::Tcp { host, port } => write!(f, "tcp {host}:{port}"),
@@ -132,6 +133,18 @@ impl Line {
             return Duration::from_micros(1750);
         }
         self.characters(7) / 2
+    }
+}
+
+impl fmt::Display for Line {
+    /// `19200 8E1`
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let parity = match self.parity {
+            Parity::None => 'N',
+            Parity::Even => 'E',
+            Parity::Odd => 'O',
+        };
+        write!(f, "{} 8{parity}{}", self.baud, self.stop_bits)
     }
 }
 

@@ -5,6 +5,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use busker::engine::configuration;
 use busker::engine::profile::Library;
 use busker::engine::yaml::Diagnostic;
 
@@ -18,6 +19,14 @@ fn each_fault_of_a_profile_is_told_in_these_words() {
         }
         let bytes = fs::read(folder.join("profile.yaml")).expect("a profile.yaml");
         library.check("profile.yaml", &bytes).err().map(|faults| rendered(&faults))
+    });
+}
+
+#[test]
+fn each_fault_of_a_configuration_is_told_in_these_words() {
+    check_folders("tests/bad-configs", |folder| {
+        let bytes = fs::read(folder.join("busker.yaml")).expect("a busker.yaml");
+        configuration::load("busker.yaml", &bytes, &Library::shipped()).err().map(|faults| rendered(&faults))
     });
 }
 

@@ -2,15 +2,19 @@
 //!
 //! A [`Part`] that cannot be read does not keep the rest from being checked.
 
+use std::marker::PhantomData;
+
+use serde_json::json;
+
 use crate::engine::configuration::words::{
     BaudRate, BrokerUrl, HostPort, Listen, Name, NoTls, Part, StopBits, Topic, Unit,
 };
 use crate::engine::device::Poll;
-use crate::engine::profile::file::{Intervals, Presentation};
+use crate::engine::profile::file::{Intervals, Point, Presentation, Wire};
 use crate::engine::settings::{OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
 use crate::engine::value::Decimal;
-use crate::engine::yaml::{At, Map, Node, record};
+use crate::engine::yaml::{At, Definitions, Faults, Json, Map, Node, Read, record};
 
 record! {
     /// The configuration of one gateway.
@@ -110,11 +114,11 @@ record! {
         name: Option<String>,
         /// With a profile: wishes for its points, by their names. Without: the points themselves, in the
         /// form of a profile.
-        points: Option<Node>,
+        points: Option<Points>,
         /// Without a profile: how the device behaves on the wire, in the form of a profile.
-        wire: Option<Node>,
+        wire: Option<Later<Wire>>,
         /// Without a profile: how the points look, in the form of a profile.
-        home_assistant: Option<Node>,
+        home_assistant: Option<Later<Map<String, Presentation>>>,
         /// The periods of the poll classes.
         poll: Option<Part<Intervals>>,
     }
@@ -130,4 +134,36 @@ record! {
         /// When it is read.
         poll: Option<At<Poll>>,
     } and presentation: Presentation
+}
+
+/// What stands under a device's `points`: wishes or whole points, which only its `profile` decides.
+#[derive(Clone, Debug)]
+pub struct Points(pub Node);
+
+impl Read for Points {
+    fn read(node: &Node, _: &mut Faults) -> Option<Points> {
+        Some(Points(node.clone()))
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        let either = [PointWish::schema(definitions), Point::schema(definitions)];
+        json!({"type": "object", "additionalProperties": {"anyOf": either}})
+    }
+}
+
+/// A `T` that is read when more is known.
+#[derive(Clone, Debug)]
+pub struct Later<T> {
+    pub node: Node,
+    shape: PhantomData<T>,
+}
+
+impl<T: Read> Read for Later<T> {
+    fn read(node: &Node, _: &mut Faults) -> Option<Later<T>> {
+        Some(Later { node: node.clone(), shape: PhantomData })
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        T::schema(definitions)
+    }
 }

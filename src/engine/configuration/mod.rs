@@ -42,12 +42,12 @@ pub fn load(
 }
 
 /// The folders under `profiles`, which must be read before [`load`]. Faults are left to [`load`].
-pub fn profile_folders(bytes: &[u8]) -> Vec<PathBuf> {
+pub fn profile_folders(file_name: &str, bytes: &[u8]) -> Vec<At<String>> {
     let mut faults = Faults::default();
-    let node = Source::from_bytes("", bytes, &mut faults).and_then(|source| parse(&source, &mut faults));
+    let source = Source::from_bytes(file_name, bytes, &mut faults);
+    let node = source.and_then(|source| parse(&source, &mut faults));
     let folders = node.as_ref().and_then(|node| node.get("profiles"));
-    let folders: Option<Vec<String>> = folders.and_then(|folders| read(folders, &mut faults));
-    folders.unwrap_or_default().into_iter().map(PathBuf::from).collect()
+    folders.and_then(|folders| read(folders, &mut faults)).unwrap_or_default()
 }
 
 /// The JSON Schema of a configuration file.
@@ -325,14 +325,16 @@ impl Resolver<'_> {
     fn device(&mut self, file: &file::Device) -> Option<Device> {
         let mut device = match &file.profile {
             Some(profile) => {
-                for (key, node) in [("wire", &file.wire), ("home_assistant", &file.home_assistant)] {
+                let own = [
+                    ("wire", file.wire.as_ref().map(|wire| &wire.node)),
+                    ("home_assistant", file.home_assistant.as_ref().map(|looks| &looks.node)),
+                ];
+                for (key, node) in own {
                     if let Some(node) = node {
-                        self.faults.add(
-                            node.named_at(),
-                            format!(
-                                "`{key}` belongs to the profile; it stands here only for a device without one"
-                            ),
+                        let message = format!(
+                            "`{key}` belongs to the profile; it stands here only for a device without one"
                         );
+                        self.faults.add(node.named_at(), message);
                     }
                 }
                 self.profile(profile)?
@@ -343,7 +345,7 @@ impl Resolver<'_> {
             self.intervals(poll, &mut device);
         }
         if let (Some(_), Some(points)) = (&file.profile, &file.points) {
-            wishes::apply(points, &mut device, &mut self.faults, &mut self.warnings);
+            wishes::apply(&points.0, &mut device, &mut self.faults, &mut self.warnings);
         }
         Some(device)
     }
@@ -362,8 +364,9 @@ impl Resolver<'_> {
             self.faults.add(&file.place, "this device has neither a `profile` nor `points` of its own");
             return None;
         };
-        let (wire, home_assistant) = (file.wire.as_ref(), file.home_assistant.as_ref());
-        profile::load_inline(points, wire, home_assistant, self.library, &mut self.faults)
+        let wire = file.wire.as_ref().map(|wire| &wire.node);
+        let looks = file.home_assistant.as_ref().map(|looks| &looks.node);
+        profile::load_inline(&points.0, wire, looks, self.library, &mut self.faults)
     }
 
     fn intervals(&mut self, file: &Intervals, device: &mut Device) {

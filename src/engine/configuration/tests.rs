@@ -160,9 +160,10 @@ fn a_faulty_profile_is_told_with_its_own_place() {
 
 #[test]
 fn the_profile_folders_are_known_before_the_rest_is_right() {
-    let folders = profile_folders(b"profiles: [/a, b]\nbuses: 3\n");
-    assert_eq!(folders, [PathBuf::from("/a"), PathBuf::from("b")]);
-    assert!(profile_folders(b"\tx").is_empty());
+    let folders = profile_folders("f", b"profiles: [/a, b]\nbuses: 3\n");
+    let told: Vec<String> = folders.iter().map(|at| format!("{} {}", at.place, at.value)).collect();
+    assert_eq!(told, ["f:1:12 /a", "f:1:16 b"]);
+    assert!(profile_folders("f", b"\tx").is_empty());
 }
 
 proptest! {

@@ -1,0 +1,248 @@
+//! `busker check`: is the configuration right, and can each bus keep up with it?
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::configuration::{self, ConfigurationArgs, Loaded};
+use super::output::{self, Table};
+use super::{Failure, output::print_json};
+use crate::engine;
+use crate::engine::device::Poll;
+use crate::engine::plan::{Cost, plan};
+use crate::engine::settings::{Bus, DeviceSettings, Link};
+use crate::engine::time::Duration;
+use crate::engine::yaml::Diagnostic;
+
+/// Check the configuration and the profiles that it uses
+///
+/// Tells every fault at once, each with its place, and then ends with exit code 2. For a good
+/// configuration it tells how busy each bus will be and how often each device will really be read.
+#[derive(clap::Args, Debug)]
+#[command(after_help = "Example:\n  busker check --config /etc/busker/busker.yaml")]
+pub struct Args {
+    #[command(flatten)]
+    configuration: ConfigurationArgs,
+    /// Tell it as JSON
+    #[arg(long)]
+    json: bool,
+    /// Print the JSON Schema of the configuration instead
+    #[arg(long)]
+    schema: bool,
+}
+
+pub fn run(args: Args) -> Result<(), Failure> {
+    if args.schema {
+        return print_json(&engine::configuration::schema());
+    }
+    let file = args.configuration.config.display().to_string();
+    match configuration::load(&args.configuration.config)? {
+        Ok(loaded) => {
+            let summary = Summary::of(file, &loaded);
+            if args.json {
+                return print_json(&summary);
+            }
+            for warning in &loaded.warnings {
+                eprintln!("warning: {warning}");
+            }
+            output::print(&summary.text())
+        }
+        Err(faults) => {
+            if args.json {
+                let faults: Vec<Finding> = faults.iter().map(Finding::of).collect();
+                print_json(&serde_json::json!({"file": file, "status": "faulty", "faults": faults}))?;
+            }
+            Err(configuration::faults(faults))
+        }
+    }
+}
+
+/// What there is to say about a good configuration.
+#[derive(Serialize)]
+struct Summary {
+    file: String,
+    status: &'static str,
+    warnings: Vec<Finding>,
+    buses: Vec<BusSummary>,
+}
+
+#[derive(Serialize)]
+struct BusSummary {
+    name: String,
+    link: String,
+    /// `19200 8E1`, where there is a line.
+    line: Option<String>,
+    /// Seconds of wire that the polls want in a second; above 1 every period is longer by as much.
+    load: f64,
+    /// How long a command waits at most for a request in flight, in seconds: all devices answering.
+    command_wait: f64,
+    /// The same where a device is silent.
+    command_wait_one_silent: f64,
+    devices: Vec<DeviceSummary>,
+}
+
+#[derive(Serialize)]
+struct DeviceSummary {
+    name: String,
+    title: String,
+    profile: String,
+    unit: u8,
+    points: usize,
+    /// By poll class.
+    polls: BTreeMap<&'static str, PollSummary>,
+}
+
+#[derive(Serialize)]
+struct PollSummary {
+    reads: usize,
+    /// The time on the wire of all its reads, in seconds.
+    seconds: f64,
+    /// Wanted, in seconds; none for what is read once.
+    period: Option<f64>,
+    /// What the bus can keep, in seconds.
+    real_period: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct Finding {
+    file: String,
+    line: usize,
+    column: usize,
+    message: String,
+}
+
+impl Finding {
+    fn of(diagnostic: &Diagnostic) -> Finding {
+        let (line, column) = diagnostic.place.line_and_column();
+        Finding { file: diagnostic.place.file().into(), line, column, message: diagnostic.message.clone() }
+    }
+}
+
+impl Summary {
+    fn of(file: String, loaded: &Loaded) -> Summary {
+        let settings = &loaded.settings;
+        let on_bus = |index: usize| settings.devices.iter().filter(move |device| device.bus == index);
+        let buses = settings.buses.iter().enumerate();
+        Summary {
+            file,
+            status: "good",
+            warnings: loaded.warnings.iter().map(Finding::of).collect(),
+            buses: buses.map(|(index, bus)| BusSummary::of(bus, on_bus(index))).collect(),
+        }
+    }
+
+    fn text(&self) -> String {
+        let mut text = format!("{} is good\n", self.file);
+        for bus in &self.buses {
+            let line = bus.line.as_ref().map_or(String::new(), |line| format!(" {line}"));
+            text.push_str(&format!("\nbus {}: {}{line}\n", bus.name, bus.link));
+            text.push_str(&format!(
+                "  busy {:.0} % of the time; a command waits at most {}, {} while a device is silent\n",
+                bus.load * 100.0,
+                told(bus.command_wait),
+                told(bus.command_wait_one_silent),
+            ));
+            if bus.load > 1.0 {
+                text.push_str(&format!(
+                    "  too slow: every period is {:.1} times as long as wanted; read less often, or faster lines\n",
+                    bus.load
+                ));
+            }
+            let mut table = Table::new();
+            for device in &bus.devices {
+                let mut cells = vec![
+                    format!("  {}", device.name),
+                    format!("unit {}", device.unit),
+                    device.profile.clone(),
+                    format!("{} points", device.points),
+                ];
+                cells.extend(device.polls.iter().map(|(name, poll)| poll.text(name)));
+                table.row(cells);
+            }
+            text.push_str(&table.render());
+        }
+        text
+    }
+}
+
+impl PollSummary {
+    fn text(&self, name: &str) -> String {
+        let reads = if self.reads == 1 { "1 read".into() } else { format!("{} reads", self.reads) };
+        match (self.period, self.real_period) {
+            (Some(wanted), Some(real)) if real > wanted => {
+                format!("{name}: {reads} in {}, wanted in {}", told(real), told(wanted))
+            }
+            (Some(wanted), _) => format!("{name}: {reads} in {}", told(wanted)),
+            (None, _) => format!("{name}: {reads}"),
+        }
+    }
+}
+
+impl BusSummary {
+    fn of<'s>(bus: &Bus, devices: impl Iterator<Item = &'s DeviceSettings>) -> BusSummary {
+        let mut longest_read = Duration::ZERO;
+        let mut longest_timeout = bus.response_timeout;
+        let mut summaries = Vec::new();
+        for settings in devices {
+            let wire = &settings.device.wire;
+            longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
+            let cost = Cost::of(&bus.link, USUAL_TURNAROUND);
+            let mut polls: BTreeMap<&'static str, PollSummary> = BTreeMap::new();
+            for read in plan(&settings.device, cost, &[]) {
+                let time = Duration::from_micros(cost.of_read(read.span)) + wire.limits.delay;
+                longest_read = longest_read.max(time);
+                let period = match read.poll {
+                    Poll::Fast => Some(wire.intervals.fast.as_secs_f64()),
+                    Poll::Slow => Some(wire.intervals.slow.as_secs_f64()),
+                    Poll::Once | Poll::Never => None,
+                };
+                let poll = polls.entry(read.poll.name()).or_insert(PollSummary {
+                    reads: 0,
+                    seconds: 0.0,
+                    period,
+                    real_period: None,
+                });
+                poll.reads += 1;
+                poll.seconds += time.as_secs_f64();
+            }
+            summaries.push(DeviceSummary {
+                name: settings.name.clone(),
+                title: settings.title.clone(),
+                profile: settings.device.profile.clone(),
+                unit: settings.unit,
+                points: settings.device.points.len(),
+                polls,
+            });
+        }
+        let polls = || summaries.iter().flat_map(|device| device.polls.values());
+        let load: f64 = polls().filter_map(|poll| Some(poll.seconds / poll.period?)).sum();
+        // A bus that cannot keep up stretches every period by the same factor.
+        for poll in summaries.iter_mut().flat_map(|device| device.polls.values_mut()) {
+            poll.real_period = poll.period.map(|period| period * load.max(1.0));
+        }
+        BusSummary {
+            name: bus.name.clone(),
+            link: bus.link.to_string(),
+            line: match &bus.link {
+                Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } => Some(line.to_string()),
+                Link::Tcp { .. } => None,
+            },
+            load,
+            command_wait: longest_read.as_secs_f64(),
+            command_wait_one_silent: longest_timeout.max(longest_read).as_secs_f64(),
+            devices: summaries,
+        }
+    }
+}
+
+/// What most devices need to begin their answer; the real one is known only on the wire.
+const USUAL_TURNAROUND: Duration = Duration::from_millis(5);
+
+/// Seconds for people: `37 ms`, `1.5 s`, `10 min`.
+fn told(seconds: f64) -> String {
+    match seconds {
+        seconds if seconds < 1.0 => format!("{:.0} ms", seconds * 1000.0),
+        seconds if seconds < 120.0 => format!("{} s", (seconds * 10.0).round() / 10.0),
+        seconds => format!("{} min", (seconds / 6.0).round() / 10.0),
+    }
+}

@@ -1,0 +1,104 @@
+//! The configuration file for the verbs that need one: reads it and the profiles that it names.
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+
+use super::Failure;
+use crate::engine::configuration::{self, Warning};
+use crate::engine::profile::Library;
+use crate::engine::settings::{Password, Settings};
+use crate::engine::yaml::Diagnostic;
+
+/// `--config FILE`, for a verb's own arguments by `#[command(flatten)]`.
+#[derive(clap::Args, Debug)]
+pub struct ConfigurationArgs {
+    /// The configuration file
+    #[arg(long, value_name = "FILE", default_value = "/etc/busker/busker.yaml")]
+    pub config: PathBuf,
+}
+
+impl ConfigurationArgs {
+    /// The settings; warnings are told on standard error.
+    pub fn load(&self) -> Result<Settings, Failure> {
+        let loaded = load(&self.config)?.map_err(faults)?;
+        for warning in &loaded.warnings {
+            eprintln!("warning: {}: {}", warning.place, warning.message);
+        }
+        Ok(loaded.settings)
+    }
+}
+
+/// A configuration without a fault.
+pub struct Loaded {
+    pub settings: Settings,
+    pub warnings: Vec<Warning>,
+    /// The shipped profiles, and over them those of the folders that the configuration names.
+    pub library: Library,
+}
+
+/// Reads the file and the profiles. A file that cannot be read at all is a [`Failure`]; what is wrong
+/// in it comes as diagnostics.
+pub fn load(path: &Path) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
+    let shown = path.display().to_string();
+    let bytes = fs::read(path)
+        .with_context(|| format!("cannot read the configuration `{shown}`"))
+        .map_err(Failure::WrongInput)?;
+    let mut library = Library::shipped();
+    let mut unreadable = Vec::new();
+    for folder in configuration::profile_folders(&shown, &bytes) {
+        // A relative folder is meant from where the file lies, wherever the program was started.
+        let place = path.parent().unwrap_or(Path::new("")).join(&folder.value);
+        if let Err(error) = add_profiles(&mut library, &place, &place) {
+            let message = format!("cannot read the profiles in `{}`: {error}", folder.value);
+            unreadable.push(Diagnostic { place: folder.place, message });
+        }
+    }
+    match configuration::load(&shown, &bytes, &library) {
+        Ok((mut settings, warnings)) if unreadable.is_empty() => {
+            settings.mqtt.password = password(settings.mqtt.password);
+            Ok(Ok(Loaded { settings, warnings, library }))
+        }
+        Ok(_) => Ok(Err(unreadable)),
+        Err(faults) => Ok(Err([unreadable, faults].concat())),
+    }
+}
+
+/// Faults as a verb returns them.
+pub fn faults(faults: Vec<Diagnostic>) -> Failure {
+    Failure::Faults(faults.iter().map(ToString::to_string).collect())
+}
+
+/// Puts every `.yaml` file below `folder` into the library, by its path below `root`.
+fn add_profiles(library: &mut Library, root: &Path, folder: &Path) -> std::io::Result<()> {
+    let mut paths: Vec<PathBuf> =
+        fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<_>>()?;
+    paths.sort();
+    for path in paths {
+        if path.is_dir() {
+            add_profiles(library, root, &path)?;
+        } else if path.extension().is_some_and(|extension| extension == "yaml") {
+            let below = path.strip_prefix(root).unwrap_or(&path).to_string_lossy();
+            library.add(&below, &path.display().to_string(), fs::read(&path)?);
+        }
+    }
+    Ok(())
+}
+
+/// The configuration's password, else that of the environment, else systemd's credential.
+fn password(configured: Password) -> Password {
+    if configured != Password::None {
+        return configured;
+    }
+    if let Ok(password) = env::var("BUSKER_MQTT_PASSWORD") {
+        return Password::Given(password);
+    }
+    let credential =
+        env::var_os("CREDENTIALS_DIRECTORY").map(|folder| Path::new(&folder).join("mqtt-password"));
+    match credential {
+        Some(path) if path.exists() => Password::File(path),
+        _ => Password::None,
+    }
+}
