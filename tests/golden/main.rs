@@ -4,6 +4,7 @@
 //! `readings.txt` (registers and what they say; the registers are written by hand) and
 //! `discovery.json` (what Home Assistant is told). `BLESS=1` rewrites them; read the difference.
 
+mod coverage;
 mod discovery;
 mod points;
 mod properties;
@@ -53,6 +54,23 @@ fn every_point_and_every_case_of_every_profile_has_a_golden_reading() {
 fn home_assistant_is_told_what_a_person_wants_to_see() {
     for (id, device) in shipped() {
         compare(id, "discovery.json", &discovery::told(device));
+    }
+}
+
+#[test]
+fn the_example_in_the_reference_is_a_profile() {
+    let reference = fs::read_to_string(place("", "../../device-profiles/README.md")).expect("it is there");
+    let example = reference
+        .split("```yaml\n")
+        .skip(1)
+        .find_map(|part| part.split_once("```"))
+        .map(|(example, _)| example)
+        .filter(|example| example.contains("device: acme/ra8"))
+        .expect("the reference begins with a whole device");
+    let mut library = Library::default();
+    library.add("acme/ra8.yaml", "device-profiles/README.md", example.as_bytes().to_vec());
+    if let Err(faults) = library.load("acme/ra8") {
+        panic!("{}", faults[0]);
     }
 }
 

@@ -17,7 +17,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use busker::engine::address::{Address, Table};
 use busker::engine::codec;
-use busker::engine::device::{Device, Encoding};
+use busker::engine::device::{Device, Encoding, Kind};
 use busker::engine::value::Reading;
 
 /// The file with everything behind the arrows worked out.
@@ -39,14 +39,20 @@ pub fn answered(device: &Device, file: &str) -> String {
     text
 }
 
-/// The points that are read, and the cases of points, that no scene gives a reading for.
+/// The points that are read, their cases and their named values, that no scene has a reading of.
 pub fn without_a_reading(device: &Device, file: &str) -> Vec<String> {
     let mut wanted = BTreeSet::new();
     for point in device.points.iter().filter(|point| point.is_read()) {
         wanted.insert(point.name.clone());
-        if let Encoding::Cases { cases, .. } = &point.encoding {
-            wanted
-                .extend(cases.iter().filter(|case| case.form.is_some()).map(|case| case_called(&case.name)));
+        match &point.encoding {
+            Encoding::Cases { cases, .. } => {
+                let with_form = cases.iter().filter(|case| case.form.is_some());
+                wanted.extend(with_form.map(|case| case_called(&case.name)));
+            }
+            Encoding::Plain(form) if form.kind == Kind::Bool => {}
+            Encoding::Plain(form) => {
+                wanted.extend(form.names.list().iter().map(|(_, name)| value_called(name)));
+            }
         }
     }
     for scene in scenes(file) {
@@ -54,6 +60,7 @@ pub fn without_a_reading(device: &Device, file: &str) -> Vec<String> {
             if let Some(case) = &told.case {
                 wanted.remove(&case_called(case));
             }
+            wanted.remove(&value_called(&told.says));
             wanted.remove(&told.name);
         }
     }
@@ -63,6 +70,10 @@ pub fn without_a_reading(device: &Device, file: &str) -> Vec<String> {
 /// One reading of each case will do for all points that have it.
 fn case_called(name: &str) -> String {
     format!("the case {name}")
+}
+
+fn value_called(name: &str) -> String {
+    format!("the value {name}")
 }
 
 struct Scene {

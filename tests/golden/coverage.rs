@@ -1,0 +1,121 @@
+//! Every register of a device's chapter is a point or left out with a reason, and no point is anywhere
+//! else. The registers stand here as the manuals list them, not as the profiles do.
+
+use busker::engine::address::{Address, Span, Table};
+use busker::engine::device::Device;
+
+use crate::shipped;
+
+const ALL: u16 = 0xFFFF;
+
+/// Registers or bits from the first to the last, and which bits of each mean something.
+type Registers = (Table, u16, u16, u16);
+
+const MANUALS: &[(&str, &[Registers])] = &[
+    // METZ CONNECT V2.1: 65 on page 3, the rest on pages 6 to 8.
+    (
+        "metz-connect/mr-do4",
+        &[
+            (Table::Coil, 0, 7, ALL),
+            (Table::Holding, 0, 0, 0x00FF),
+            (Table::Holding, 1, 1, 0x000F),
+            (Table::Holding, 65, 66, ALL),
+        ],
+    ),
+    // Pages 16 and 17.
+    (
+        "metz-connect/mr-si4",
+        &[
+            (Table::Discrete, 0, 3, ALL),
+            (Table::Input, 0, 19, ALL),
+            (Table::Input, 20, 20, 0x000F),
+            (Table::Holding, 0, 31, ALL),
+            (Table::Holding, 32, 35, 0x0001),
+            (Table::Holding, 36, 39, ALL),
+            (Table::Holding, 40, 43, 0x0001),
+            (Table::Holding, 65, 65, ALL),
+        ],
+    ),
+    // 65 on page 3, the rest on pages 48 to 57.
+    (
+        "metz-connect/mr-ai8",
+        &[
+            (Table::Coil, 0, 0, ALL),
+            (Table::Discrete, 0, 7, ALL),
+            (Table::Input, 0, 15, ALL),
+            (Table::Input, 70, 70, 0x00FF),
+            (Table::Holding, 0, 15, ALL),
+            (Table::Holding, 16, 23, 0x01FF),
+            (Table::Holding, 24, 63, ALL),
+            (Table::Holding, 65, 65, ALL),
+            (Table::Holding, 68, 68, 0x0001),
+            (Table::Holding, 70, 101, ALL),
+        ],
+    ),
+    // FuehlerSysteme, chapters 6.1.1, 6.1.2 and 7: Rreg are input, RWreg and Wreg holding registers.
+    (
+        "fuehlersysteme/relay8",
+        &[
+            (Table::Input, 0, 8, ALL),
+            (Table::Input, 9, 9, 0x00FF),
+            (Table::Input, 79, 79, ALL),
+            (Table::Input, 100, 227, ALL),
+            (Table::Holding, 0, 9, ALL),
+            (Table::Holding, 11, 18, ALL),
+            (Table::Holding, 19, 19, 0x00FF),
+            (Table::Holding, 21, 28, ALL),
+            (Table::Holding, 31, 38, ALL),
+            (Table::Holding, 40, 40, 0x00FF),
+            (Table::Holding, 41, 49, ALL),
+            (Table::Holding, 51, 58, ALL),
+            (Table::Holding, 61, 68, ALL),
+            (Table::Holding, 69, 69, 0x00FF),
+            (Table::Holding, 71, 79, ALL),
+            (Table::Holding, 90, 99, ALL),
+            (Table::Holding, 200, 327, ALL),
+            (Table::Holding, 500, 627, ALL),
+        ],
+    ),
+];
+
+#[test]
+fn every_register_of_the_manual_is_a_point_or_left_out_and_nothing_else_is() {
+    for (id, device) in shipped() {
+        let (_, chapter) =
+            MANUALS.iter().find(|(profile, _)| profile == id).unwrap_or_else(|| panic!("{id}: no registers"));
+        for table in Table::ALL {
+            for at in 0..=1000 {
+                let place = Span::single(table, at);
+                let in_manual = chapter
+                    .iter()
+                    .filter(|(of, first, last, _)| *of == table && (*first..=*last).contains(&at))
+                    .fold(0, |bits, (_, _, _, more)| bits | more);
+                let in_profile = bits_of_points(device, place);
+                let is_left_out = device.left_out.iter().any(|left_out| left_out.span.contains(place));
+                assert_eq!(in_profile & !in_manual, 0, "{id}: {place} has points that the manual has not");
+                assert!(
+                    is_left_out || in_manual & !in_profile == 0,
+                    "{id}: {place} has bits {:04X} without a point",
+                    in_manual & !in_profile
+                );
+                assert!(!is_left_out || in_manual != 0, "{id}: {place} is left out of nothing");
+            }
+        }
+    }
+}
+
+/// Which bits of `place` some point reads or writes.
+fn bits_of_points(device: &Device, place: Span) -> u16 {
+    let of_address = |address: Address| {
+        if !address.span.contains(place) {
+            return 0;
+        }
+        address.bits.map_or(ALL, |bits| bits.mask())
+    };
+    device
+        .points
+        .iter()
+        .flat_map(|point| [Some(point.at), point.also, point.write.as_ref().map(|write| write.at)])
+        .flatten()
+        .fold(0, |bits, address| bits | of_address(address))
+}
