@@ -72,7 +72,7 @@ pub fn faults(faults: Vec<Diagnostic>) -> Failure {
 }
 
 /// Puts every `.yaml` file below `folder` into the library, by its path below `root`.
-fn add_profiles(library: &mut Library, root: &Path, folder: &Path) -> std::io::Result<()> {
+pub fn add_profiles(library: &mut Library, root: &Path, folder: &Path) -> std::io::Result<()> {
     let mut paths: Vec<PathBuf> =
         fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<_>>()?;
     paths.sort();

@@ -14,6 +14,7 @@
 mod check;
 pub mod configuration;
 pub mod output;
+mod profiles;
 mod simulate;
 
 use clap::{Parser, Subcommand};
@@ -37,6 +38,7 @@ macro_rules! verbs {
 
 verbs! {
     check Check,
+    profiles Profiles,
     simulate Simulate,
 }
 

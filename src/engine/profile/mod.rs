@@ -41,6 +41,14 @@ impl Library {
         faults.into_result(device)
     }
 
+    /// The number of cases in a shared file that need not be in the library.
+    pub fn check_shared(&self, shown: &str, bytes: &[u8]) -> Result<usize, Vec<Diagnostic>> {
+        let mut faults = Faults::default();
+        let source = Source::from_bytes(shown, bytes, &mut faults);
+        let cases = source.map(|source| shared::cases_in(&source, &mut faults).iter().count());
+        faults.into_result(cases)
+    }
+
     fn device_in(&self, source: &Arc<Source>, id: Option<&str>, faults: &mut Faults) -> Option<Device> {
         let node = parse(source, faults)?;
         let Some(profile) = read::<Profile>(&node, faults) else {

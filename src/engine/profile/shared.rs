@@ -1,10 +1,11 @@
 //! Files with cases that several profiles share: `device-profiles/shared/measuring.yaml`.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use crate::engine::profile::file::{Cases, Point, Profile, SharedCase, Values};
 use crate::engine::profile::library::Library;
-use crate::engine::yaml::{Faults, Map, Place, list_of_choices, parse, read};
+use crate::engine::yaml::{Faults, Map, Place, Source, list_of_choices, parse, read};
 
 /// The shared files that one profile uses, by their names.
 #[derive(Default)]
@@ -29,22 +30,7 @@ impl Shared {
                 continue;
             }
             let Some(source) = library.source(file, faults) else { continue };
-            let cases: Option<Map<i128, SharedCase>> =
-                parse(&source, faults).and_then(|node| read(&node, faults));
-            let cases = cases.unwrap_or_default();
-            for (at, (key, case)) in cases.iter().enumerate() {
-                if let Some((first, _)) =
-                    cases.iter().take(at).find(|(_, other)| other.name.value == case.name.value)
-                {
-                    faults.add(
-                        &case.name.place,
-                        format!(
-                            "`{}` is the name of {} and of {}; expected another name",
-                            case.name.value, first.value, key.value
-                        ),
-                    );
-                }
-            }
+            let cases = cases_in(&source, faults);
             shared.0.insert(file.into(), cases);
         }
         shared
@@ -53,6 +39,25 @@ impl Shared {
     pub fn get(&self, file: &str) -> Option<&Map<i128, SharedCase>> {
         self.0.get(file)
     }
+}
+
+/// The cases of one file, each with a name of its own.
+pub fn cases_in(source: &Arc<Source>, faults: &mut Faults) -> Map<i128, SharedCase> {
+    let cases: Option<Map<i128, SharedCase>> = parse(source, faults).and_then(|node| read(&node, faults));
+    let cases = cases.unwrap_or_default();
+    for (at, (key, case)) in cases.iter().enumerate() {
+        let name = &case.name.value;
+        if let Some((first, _)) = cases.iter().take(at).find(|(_, other)| other.name.value == *name) {
+            faults.add(
+                &case.name.place,
+                format!(
+                    "`{name}` is the name of {} and of {}; expected another name",
+                    first.value, key.value
+                ),
+            );
+        }
+    }
+    cases
 }
 
 fn references(point: &Point) -> Vec<(&str, &Place)> {

@@ -1,0 +1,325 @@
+//! A profile as data for other programs: every point, with all that is known of it on the wire.
+
+use serde_json::{Map, Value as Json, json};
+
+use super::access;
+use crate::engine::address::Span;
+use crate::engine::device::{
+    Case, Decimals, Device, Encoding, Form, Identify, Kind, Order, PointIndex, Unit, WriteRule,
+};
+use crate::engine::homeassistant::entity;
+use crate::engine::value::Decimal;
+
+/// One line of `profiles list`.
+pub fn summary(device: &Device) -> Json {
+    json!({
+        "device": device.profile,
+        "manufacturer": device.manufacturer,
+        "model": device.model,
+        "source": device.source.trim(),
+        "points": device.points.len(),
+    })
+}
+
+/// The whole profile.
+pub fn device(device: &Device) -> Json {
+    let wire = &device.wire;
+    let points: Vec<Json> = (0..device.points.len()).map(|index| point(device, index)).collect();
+    let left_out = device.left_out.iter().map(|left_out| with_reason(left_out.span, &left_out.reason));
+    let forbidden = wire.forbidden.iter().map(|forbidden| with_reason(forbidden.span, &forbidden.reason));
+    json!({
+        "device": device.profile,
+        "manufacturer": device.manufacturer,
+        "model": device.model,
+        "source": device.source.trim(),
+        "identify": device.identify.as_ref().map(identify),
+        "limits": {
+            "read_registers": wire.limits.read_registers,
+            "read_bits": wire.limits.read_bits,
+            "write_registers": wire.limits.write_registers,
+            "gap": wire.limits.gap,
+            "delay_ms": wire.limits.delay.as_millis() as u64,
+        },
+        "readable": wire.readable.iter().map(|read| span(*read)).collect::<Vec<_>>(),
+        "forbidden": forbidden.collect::<Vec<_>>(),
+        "left_out": left_out.collect::<Vec<_>>(),
+        "poll": {
+            "fast_ms": wire.intervals.fast.as_millis() as u64,
+            "slow_ms": wire.intervals.slow.as_millis() as u64,
+        },
+        "response_timeout_ms": wire.response_timeout.map(|timeout| timeout.as_millis() as u64),
+        "quirks": {
+            "clamps_with_exception": wire.quirks.clamps_with_exception,
+            "exception_function_varies": wire.quirks.exception_function_varies,
+        },
+        "watchdog": wire.watchdog.map(|point| name(device, point)),
+        "points": points,
+        "things": [],
+    })
+}
+
+fn identify(identify: &Identify) -> Json {
+    match identify {
+        Identify::Names { vendor, product } => json!({"vendor": vendor, "product": product}),
+        Identify::Word { at, mask, equals } => json!({
+            "table": at.table().name(), "address": at.first(), "mask": mask, "equals": equals,
+        }),
+    }
+}
+
+fn span(span: Span) -> Json {
+    json!({"table": span.table().name(), "first": span.first(), "last": span.last()})
+}
+
+fn with_reason(at: Span, reason: &str) -> Json {
+    let mut json = span(at);
+    json["reason"] = reason.trim().into();
+    json
+}
+
+fn name(device: &Device, point: PointIndex) -> &str {
+    &device.points[point].name
+}
+
+fn point(device: &Device, index: PointIndex) -> Json {
+    let point = &device.points[index];
+    let plain = point.plain();
+    let write = point.write.as_ref();
+    let range = plain.and_then(|form| raw_limits(form, write.map(|write| &write.rule)));
+    let press = write.and_then(|write| match write.rule {
+        WriteRule::Press { word, .. } => Some(word),
+        _ => None,
+    });
+    let self_clearing =
+        write.is_some_and(|write| matches!(write.rule, WriteRule::Press { self_clearing: true, .. }));
+    let writable_names = write.and_then(|write| match &write.rule {
+        WriteRule::Names(names) => Some(names),
+        _ => None,
+    });
+    json!({
+        "name": point.name,
+        "table": point.at.span.table().name(),
+        "address": point.at.span.first(),
+        "count": point.at.span.count(),
+        "elements": 1,
+        "bits": point.at.bits.map(|bits| [bits.low(), bits.high()]),
+        "also": point.also.map(|also| json!({
+            "table": also.span.table().name(),
+            "address": also.span.first(),
+            "count": also.span.count(),
+            "bits": also.bits.map(|bits| [bits.low(), bits.high()]),
+        })),
+        "type": plain.map(|form| form.kind.name()),
+        "order": plain.map(|form| order(form.order)),
+        "scale": plain.map(|form| number(scale(form))),
+        "offset": plain.map(|form| number(form.offset)),
+        "unit": plain.and_then(unit),
+        "unit_by": plain.and_then(|form| unit_by(device, form)),
+        "decimals_by": plain.and_then(|form| decimals_by(device, form)),
+        "difference": point_is_difference(&point.encoding),
+        "access": access(point),
+        "write_at": write.filter(|write| write.at != point.at).map(|write| json!({
+            "table": write.at.span.table().name(),
+            "address": write.at.span.first(),
+            "count": write.at.span.count(),
+            "bits": write.at.bits.map(|bits| [bits.low(), bits.high()]),
+        })),
+        "write_with": write.and_then(|write| write.with).map(|function| function.code()),
+        "writable_names": writable_names,
+        "press": press,
+        "self_clearing": self_clearing,
+        "persistent": point.persistent,
+        "read_clears": point.read_clears,
+        "poll": point.poll.name(),
+        "min": range.map(|(min, _)| number(min)),
+        "max": range.map(|(_, max)| number(max)),
+        "default": point.default.map(|default| number(Decimal::integer(default))),
+        "values": values(&point.encoding),
+        "invalid": invalid(&point.encoding),
+        "re_read": point.re_read.iter().map(|other| name(device, *other)).collect::<Vec<_>>(),
+        "by": match &point.encoding {
+            Encoding::Plain(_) => None,
+            Encoding::Cases { by, .. } => Some(name(device, *by)),
+        },
+        "like": null,
+        "cases": match &point.encoding {
+            Encoding::Plain(_) => Json::Null,
+            Encoding::Cases { cases, .. } => {
+                cases.iter().map(|case| (case.name.clone(), case_json(device, case))).collect::<Map<_, _>>().into()
+            }
+        },
+        "when": null,
+        "entity": entity_json(device, index),
+    })
+}
+
+fn case_json(device: &Device, case: &Case) -> Json {
+    let Some(form) = &case.form else { return Json::Null };
+    let range = raw_limits(form, None);
+    json!({
+        "key": number(Decimal::integer(case.key)),
+        "type": form.kind.name(),
+        "scale": number(scale(form)),
+        "offset": number(form.offset),
+        "unit": unit(form),
+        "unit_by": unit_by(device, form),
+        "decimals_by": decimals_by(device, form),
+        "min": range.map(|(min, _)| number(min)),
+        "max": range.map(|(_, max)| number(max)),
+        "values": named(form),
+        "invalid": invalid_words(form),
+    })
+}
+
+/// What Home Assistant shows, whatever the registers that decide hold. Of a point with cases: what
+/// all of its cases agree in.
+fn entity_json(device: &Device, index: PointIndex) -> Json {
+    let usual: Vec<Option<i128>> = device
+        .points
+        .iter()
+        .map(|point| {
+            let named = point.plain().and_then(|form| form.names.list().first()).map(|(raw, _)| *raw);
+            Some(point.default.or(named).unwrap_or(0))
+        })
+        .collect();
+    let all: Vec<Json> = match &device.points[index].encoding {
+        Encoding::Plain(_) => {
+            entity(device, index, &usual).into_iter().map(|entity| entity.to_json()).collect()
+        }
+        Encoding::Cases { by, cases } => cases
+            .iter()
+            .filter_map(|case| {
+                let mut known = usual.clone();
+                known[*by] = Some(case.key);
+                entity(device, index, &known)
+            })
+            .map(|entity| entity.to_json())
+            .collect(),
+    };
+    let agreed = all.into_iter().reduce(|mut agreed, other| {
+        for (key, value) in agreed.as_object_mut().into_iter().flatten() {
+            if other[key.as_str()] != *value {
+                *value = Json::Null;
+            }
+        }
+        agreed
+    });
+    agreed.unwrap_or(Json::Null)
+}
+
+fn point_is_difference(encoding: &Encoding) -> bool {
+    match encoding {
+        Encoding::Plain(form) => form.difference,
+        Encoding::Cases { cases, .. } => {
+            cases.iter().filter_map(|case| case.form.as_ref()).any(|form| form.difference)
+        }
+    }
+}
+
+/// The factor from the register to the unit, fixed decimals included.
+fn scale(form: &Form) -> Decimal {
+    let shift = match form.decimals {
+        Some(Decimals::Fixed(decimals)) => decimals,
+        Some(Decimals::By(_)) | None => 0,
+    };
+    Decimal { units: form.scale.units, decimals: form.scale.decimals + shift }.normalized()
+}
+
+/// Between which raw values it may be written, or else measures; never more than its type holds.
+fn raw_limits(form: &Form, rule: Option<&WriteRule>) -> Option<(Decimal, Decimal)> {
+    let (min, max) = match (rule, form.range) {
+        (Some(WriteRule::Range { min, max, .. }), _) => (*min, *max),
+        (_, Some((min, max))) if form.difference => {
+            let widest = max.checked_add(min.negated())?;
+            (widest.negated(), widest)
+        }
+        (_, range) => range?,
+    };
+    let (a, b) = (to_raw(form, min)?, to_raw(form, max)?);
+    let (min, max) = if a.compare(b).is_le() { (a, b) } else { (b, a) };
+    let Some((low, high)) = form.kind.integer_range() else { return Some((min, max)) };
+    let (low, high) = (Decimal::integer(low), Decimal::integer(high));
+    let within = |raw: Decimal| match raw.compare(low).is_lt() {
+        true => low,
+        false if raw.compare(high).is_gt() => high,
+        false => raw,
+    };
+    Some((within(min), within(max)))
+}
+
+fn to_raw(form: &Form, value: Decimal) -> Option<Decimal> {
+    let offset = if form.difference { Decimal::ZERO } else { form.offset };
+    let above = value.checked_add(offset.negated())?;
+    let scale = scale(form);
+    if let Some(raw) = above.divided_exactly_by(scale) {
+        return Some(Decimal::integer(raw));
+    }
+    let raw = above.to_f64() / scale.to_f64();
+    Decimal::parse(&if form.kind.is_float() { raw.to_string() } else { format!("{raw:.0}") })
+}
+
+fn unit(form: &Form) -> Option<&str> {
+    match &form.unit {
+        Unit::Fixed(unit) => Some(unit),
+        Unit::None | Unit::By(_) => None,
+    }
+}
+
+fn unit_by<'d>(device: &'d Device, form: &Form) -> Option<&'d str> {
+    match form.unit {
+        Unit::By(point) => Some(name(device, point)),
+        Unit::None | Unit::Fixed(_) => None,
+    }
+}
+
+fn decimals_by<'d>(device: &'d Device, form: &Form) -> Option<&'d str> {
+    match form.decimals {
+        Some(Decimals::By(point)) => Some(name(device, point)),
+        Some(Decimals::Fixed(_)) | None => None,
+    }
+}
+
+fn order(order: Order) -> &'static str {
+    match order {
+        Order::Abcd => "abcd",
+        Order::Cdab => "cdab",
+        Order::Badc => "badc",
+        Order::Dcba => "dcba",
+    }
+}
+
+fn values(encoding: &Encoding) -> Json {
+    match encoding {
+        Encoding::Plain(form) => named(form),
+        Encoding::Cases { .. } => json!({}),
+    }
+}
+
+fn named(form: &Form) -> Json {
+    if form.kind == Kind::Bool {
+        return json!({"0": "OFF", "1": "ON"});
+    }
+    let named = form.names.list().iter().map(|(raw, name)| (raw.to_string(), Json::from(name.as_str())));
+    named.collect::<Map<_, _>>().into()
+}
+
+fn invalid(encoding: &Encoding) -> Json {
+    match encoding {
+        Encoding::Plain(form) => invalid_words(form),
+        Encoding::Cases { .. } => json!({}),
+    }
+}
+
+fn invalid_words(form: &Form) -> Json {
+    let words = form.invalid.iter().map(|(word, reason)| (word.to_string(), Json::from(reason.as_str())));
+    words.collect::<Map<_, _>>().into()
+}
+
+/// As a JSON number: whole ones without a dot.
+fn number(number: Decimal) -> Json {
+    let number = number.normalized();
+    match (number.decimals, i64::try_from(number.units)) {
+        (0, Ok(whole)) => whole.into(),
+        _ => number.to_f64().into(),
+    }
+}
