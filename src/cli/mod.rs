@@ -11,11 +11,14 @@
 //! ends the process by itself and never prints its own failure: it returns a [`Failure`], and
 //! `main.rs` prints it and chooses the exit code.
 
+mod by_hand;
 mod check;
 pub mod configuration;
 pub mod output;
 mod profiles;
+mod read;
 mod simulate;
+mod write;
 
 use clap::{Parser, Subcommand};
 
@@ -39,7 +42,9 @@ macro_rules! verbs {
 verbs! {
     check Check,
     profiles Profiles,
+    read Read,
     simulate Simulate,
+    write Write,
 }
 
 /// Connects Modbus devices to Home Assistant and to anything that speaks MQTT.

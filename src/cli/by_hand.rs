@@ -1,0 +1,242 @@
+//! One device by hand: which line, which unit, and a question with its answer.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, anyhow};
+
+use super::{Failure, configuration};
+use crate::edge::clock::Clock;
+use crate::edge::guarded_link::GuardedLink;
+use crate::edge::link::Link;
+use crate::engine::address::Span;
+use crate::engine::codec::{self, Raw};
+use crate::engine::command::words_of;
+use crate::engine::device::{Device, PointIndex};
+use crate::engine::modbus::guard::Guard;
+use crate::engine::modbus::{Answer, Call, Request, RequestError};
+use crate::engine::settings::{self, Line, Parity};
+use crate::engine::time::Duration;
+use crate::engine::yaml::Scalar;
+
+/// Where the device is: for a verb's own arguments by `#[command(flatten)]`.
+#[derive(Debug, clap::Args)]
+pub struct ByHand {
+    #[command(flatten)]
+    line: WhichLine,
+    /// The device's name in the configuration
+    #[arg(long, value_name = "NAME", requires = "config")]
+    device: Option<String>,
+    /// The device's unit on the line
+    #[arg(long, value_name = "UNIT", conflicts_with = "config")]
+    unit: Option<u8>,
+    /// The line's bit rate
+    #[arg(long, value_name = "RATE", default_value_t = 19200, value_parser = clap::value_parser!(u32).range(300..=1_000_000), conflicts_with = "config")]
+    baud: u32,
+    /// The line's parity: even, odd or none
+    #[arg(long, default_value = "even", value_parser = parity, conflicts_with = "config")]
+    parity: Parity,
+    /// The line's stop bits: 1 or 2
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=2), conflicts_with = "config")]
+    stop_bits: u8,
+    /// How long a reply may take
+    #[arg(long, value_name = "TIME", default_value = "500ms", value_parser = <Duration as Scalar>::parse, conflicts_with = "config")]
+    timeout: Duration,
+}
+
+#[derive(Debug, clap::Args)]
+#[group(required = true, multiple = false)]
+struct WhichLine {
+    /// RTU on this serial port
+    #[arg(long, value_name = "PORT", requires = "unit")]
+    serial: Option<String>,
+    /// Modbus TCP at this address; without a port 502
+    #[arg(long, value_name = "ADDRESS:PORT", requires = "unit")]
+    tcp: Option<String>,
+    /// RTU through a serial server at this address
+    #[arg(long, value_name = "ADDRESS:PORT", requires = "unit")]
+    rtu_over_tcp: Option<String>,
+    /// The configuration that knows the device
+    #[arg(long, value_name = "FILE", requires = "device")]
+    config: Option<PathBuf>,
+}
+
+fn parity(name: &str) -> Result<Parity, String> {
+    match name {
+        "none" => Ok(Parity::None),
+        "even" => Ok(Parity::Even),
+        "odd" => Ok(Parity::Odd),
+        _ => Err("expected even, odd or none".into()),
+    }
+}
+
+/// A device that can be asked.
+pub struct Asked {
+    link: GuardedLink,
+    unit: u8,
+    timeout: Duration,
+    /// Its profile, where the configuration names one.
+    pub device: Option<Device>,
+}
+
+/// A question's fate: the device's word, or why there is none.
+type Answered = Result<Answer, RequestError>;
+
+impl ByHand {
+    /// Opens the line.
+    pub fn open(&self) -> Result<Asked, Failure> {
+        let line = Line { baud: self.baud, parity: self.parity, stop_bits: self.stop_bits };
+        let link = match (&self.line.serial, &self.line.tcp, &self.line.rtu_over_tcp) {
+            (Some(path), ..) => settings::Link::Serial { path: path.clone(), line },
+            (_, Some(address), _) => {
+                let (host, port) = host_and_port(address)?;
+                settings::Link::Tcp { host, port }
+            }
+            (.., Some(address)) => {
+                let (host, port) = host_and_port(address)?;
+                settings::Link::RtuOverTcp { host, port, line }
+            }
+            _ => return self.open_configured(),
+        };
+        let unit = self.unit.unwrap_or_default();
+        if !matches!(link, settings::Link::Tcp { .. }) && !(1..=247).contains(&unit) {
+            return Err(Failure::wrong(format!("unit {unit} cannot be asked; expected 1 to 247")));
+        }
+        open(&link, None, unit, self.timeout, None)
+    }
+
+    fn open_configured(&self) -> Result<Asked, Failure> {
+        let path = self.line.config.clone().unwrap_or_default();
+        let settings = configuration::ConfigurationArgs { config: path }.load()?;
+        let name = self.device.as_deref().unwrap_or_default();
+        let Some(device) = settings.devices.iter().find(|device| device.name == name) else {
+            let names: Vec<String> =
+                settings.devices.iter().map(|device| format!("`{}`", device.name)).collect();
+            return Err(Failure::wrong(format!(
+                "there is no device `{name}`; expected one of {}",
+                names.join(", ")
+            )));
+        };
+        let bus = &settings.buses[device.bus];
+        let timeout = device.device.wire.response_timeout.unwrap_or_default().max(bus.response_timeout);
+        open(&bus.link, bus.gap, device.unit, timeout, Some(device.device.clone()))
+    }
+}
+
+fn open(
+    link: &settings::Link,
+    gap: Option<Duration>,
+    unit: u8,
+    timeout: Duration,
+    device: Option<Device>,
+) -> Result<Asked, Failure> {
+    let opened = Link::open(link).map_err(|lost| anyhow!("{lost}"))?;
+    let link = GuardedLink::new(opened, Guard::new(link, gap), Clock::start());
+    Ok(Asked { link, unit, timeout, device })
+}
+
+fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
+    match address.rsplit_once(':') {
+        Some((host, port)) if !host.is_empty() && (!host.contains(':') || host.ends_with(']')) => {
+            let number =
+                port.parse().map_err(|_| Failure::wrong(format!("`{port}` in `{address}` is no port")))?;
+            Ok((host.trim_matches(['[', ']']).to_owned(), number))
+        }
+        None if !address.is_empty() => Ok((address.to_owned(), 502)),
+        _ => Err(Failure::wrong(format!("`{address}` is no address; expected one like `192.168.1.20:502`"))),
+    }
+}
+
+impl Asked {
+    pub fn unit(&self) -> u8 {
+        self.unit
+    }
+
+    /// One question. `Err` outside: the line is lost.
+    pub fn ask(&mut self, call: &Call) -> Result<Answered, Failure> {
+        if let Some(device) = &self.device {
+            std::thread::sleep(device.wire.limits.delay);
+        }
+        let quirks = self.device.as_ref().map(|device| device.wire.quirks).unwrap_or_default();
+        let any_exception = quirks.exception_function_varies;
+        let request = Request { unit: self.unit, call: call.clone(), any_exception };
+        let reply = self.link.ask(&request, self.timeout).map_err(|lost| anyhow!("{lost}"))?;
+        match reply.result {
+            Err(RequestError::Impossible(reason)) => Err(Failure::wrong(format!("{call}: {reason}"))),
+            result => Ok(result),
+        }
+    }
+
+    /// The words (a bit is 0 or 1) of `span`.
+    pub fn read(&mut self, span: Span) -> Result<Vec<u16>, Failure> {
+        let answer = self.ask(&Call::Read(span))?;
+        let answer = answer.map_err(|error| anyhow!("{error}")).with_context(|| self.asking(span))?;
+        Ok(words_of(&answer))
+    }
+
+    /// Which point is called `name`.
+    pub fn point(&self, name: &str) -> Result<PointIndex, Failure> {
+        let Some(device) = &self.device else {
+            return Err(Failure::wrong(format!(
+                "`{name}` is no address; expected one like `holding 0..3`, or a point's name with --config and --device"
+            )));
+        };
+        device.points.iter().position(|point| point.name == name).ok_or_else(|| {
+            Failure::wrong(format!(
+                "`{name}` is no point of {} and no address like `holding 0..3`; `busker profiles show {0}` lists the points",
+                device.profile
+            ))
+        })
+    }
+
+    /// Reads what decides how `point` is understood, and what decides that.
+    pub fn learn(
+        &mut self,
+        device: &Device,
+        point: PointIndex,
+        known: &mut [Option<i128>],
+    ) -> Result<(), Failure> {
+        for selector in device.points[point].selectors() {
+            if known[selector].is_some() {
+                continue;
+            }
+            self.learn(device, selector, known)?;
+            let at = device.points[selector].at;
+            let words = self.read(at.span)?;
+            if let (Ok(resolved), Some(words)) =
+                (codec::resolve(device, selector, known), codec::words_at(at, at.span.first(), &words))
+            {
+                if let Raw::Integer(raw) = codec::raw(resolved.form, &words) {
+                    known[selector] = Some(raw);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn asking(&self, span: Span) -> String {
+        format!("unit {}: `{span}` cannot be read", self.unit)
+    }
+}
+
+/// `holding 0..3`, if that is what `text` means; a word without a table is left to others.
+pub fn span(text: &str) -> Option<Result<Span, Failure>> {
+    let word = text.split_whitespace().next().unwrap_or_default();
+    let is_address = text.contains(' ') || crate::engine::address::Table::from_name(word).is_some();
+    is_address.then(|| <Span as Scalar>::parse(text).map_err(Failure::wrong))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_is_a_host_and_perhaps_a_port() {
+        let parts = |text: &str| host_and_port(text).ok();
+        assert_eq!(parts("192.168.1.20:1502"), Some(("192.168.1.20".into(), 1502)));
+        assert_eq!(parts("plc.local"), Some(("plc.local".into(), 502)));
+        assert_eq!(parts("[::1]:502"), Some(("::1".into(), 502)));
+        for wrong in ["", ":502", "host:port", "host:70000", "::1"] {
+            assert_eq!(parts(wrong), None, "{wrong}");
+        }
+    }
+}
