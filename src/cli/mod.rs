@@ -15,6 +15,7 @@ mod by_hand;
 mod check;
 pub mod configuration;
 pub mod output;
+mod plan;
 mod profiles;
 mod read;
 mod simulate;
@@ -41,6 +42,7 @@ macro_rules! verbs {
 
 verbs! {
     check Check,
+    plan Plan,
     profiles Profiles,
     read Read,
     simulate Simulate,

@@ -1,0 +1,127 @@
+//! `busker plan`: what each device will be asked, as a table.
+
+use serde::Serialize;
+
+use super::configuration::ConfigurationArgs;
+use super::output::{print, print_json};
+use super::{Failure, configuration};
+use crate::engine::device::Device;
+use crate::engine::plan::{self, Cost, Read};
+use crate::engine::profile::Library;
+use crate::engine::settings::{Line, Link, Parity};
+use crate::engine::time::Duration;
+
+/// Before a device's own latency is measured.
+const TURNAROUND: Duration = Duration::from_millis(5);
+
+/// Show the reads that each device will be asked with
+///
+/// One line for each read: how often, the registers, and the points that it brings.
+#[derive(clap::Args, Debug)]
+#[command(after_help = "Examples:\n  busker plan --config /etc/busker/busker.yaml\n  \
+    busker plan --profile metz-connect/mr-ai8")]
+pub struct Args {
+    #[command(flatten)]
+    configuration: ConfigurationArgs,
+    /// Only this device of the configuration
+    #[arg(long, value_name = "NAME")]
+    device: Option<String>,
+    /// The plan of a profile on a line of 19200 8E1, without a configuration
+    #[arg(long, value_name = "ID", conflicts_with_all = ["config", "device"])]
+    profile: Option<String>,
+    /// Tell it as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// One device's reads.
+#[derive(Serialize)]
+struct DevicePlan {
+    device: String,
+    reads: Vec<ReadRow>,
+    #[serde(skip)]
+    table: String,
+}
+
+#[derive(Serialize)]
+struct ReadRow {
+    poll: &'static str,
+    table: &'static str,
+    first: u16,
+    last: u16,
+    points: Vec<String>,
+    /// How long it takes, in milliseconds.
+    wire_ms: f64,
+}
+
+pub fn run(args: Args) -> Result<(), Failure> {
+    let plans = match &args.profile {
+        Some(id) => vec![of_profile(id)?],
+        None => of_configuration(&args)?,
+    };
+    if args.json {
+        return print_json(&plans);
+    }
+    let mut text = String::new();
+    for plan in &plans {
+        if plans.len() > 1 || args.profile.is_none() {
+            text.push_str(&format!("{}\n", plan.device));
+        }
+        text.push_str(&plan.table);
+        text.push('\n');
+    }
+    print(text.trim_end_matches('\n'))?;
+    print("\n")
+}
+
+fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
+    let library = Library::shipped();
+    if !library.contains(id) {
+        return Err(Failure::wrong(format!(
+            "no profile is called `{id}`; there are {}",
+            library.ids().join(", ")
+        )));
+    }
+    let device = library.load(id).map_err(configuration::faults)?;
+    let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
+    let link = Link::Serial { path: String::new(), line };
+    Ok(plan_of(id, &device, Cost::of(&link, TURNAROUND)))
+}
+
+fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
+    let settings = args.configuration.load()?;
+    let wanted = |name: &str| args.device.as_deref().is_none_or(|device| device == name);
+    let devices: Vec<_> = settings.devices.iter().filter(|device| wanted(&device.name)).collect();
+    if devices.is_empty() {
+        let names: Vec<&str> = settings.devices.iter().map(|device| device.name.as_str()).collect();
+        let wanted = args.device.as_deref().unwrap_or_default();
+        return Err(Failure::wrong(format!(
+            "no device is called `{wanted}`; there are {}",
+            names.join(", ")
+        )));
+    }
+    Ok(devices
+        .into_iter()
+        .map(|device| {
+            let cost = Cost::of(&settings.buses[device.bus].link, TURNAROUND);
+            plan_of(&device.name, &device.device, cost)
+        })
+        .collect())
+}
+
+fn plan_of(name: &str, device: &Device, cost: Cost) -> DevicePlan {
+    let reads = plan::plan(device, cost, &[]);
+    let row = |read: &Read| ReadRow {
+        poll: read.poll.name(),
+        table: read.span.table().name(),
+        first: read.span.first(),
+        last: read.span.last(),
+        points: read.points.iter().map(|(point, _)| device.points[*point].name.clone()).collect(),
+        wire_ms: cost.of_read(read.span) as f64 / 1000.0,
+    };
+    DevicePlan {
+        device: name.to_string(),
+        reads: reads.iter().map(row).collect(),
+        table: plan::Table { device, reads: &reads }.to_string(),
+    }
+}
