@@ -14,10 +14,12 @@
 mod by_hand;
 mod check;
 pub mod configuration;
+pub mod log;
 pub mod output;
 mod plan;
 mod profiles;
 mod read;
+mod run;
 mod simulate;
 mod write;
 
@@ -45,6 +47,7 @@ verbs! {
     plan Plan,
     profiles Profiles,
     read Read,
+    run Run,
     simulate Simulate,
     write Write,
 }
