@@ -3,7 +3,9 @@
 use std::fmt;
 
 use crate::engine::time::{Duration, Time};
+use crate::simulator::fuehlersysteme::relay8::Relay8;
 use crate::simulator::metz_connect::MetzConnect;
+use crate::simulator::metz_connect::mr_ai8::MrAi8;
 use crate::simulator::metz_connect::mr_do4::MrDo4;
 use crate::simulator::metz_connect::mr_si4::MrSi4;
 
@@ -150,16 +152,20 @@ impl fmt::Display for Parity {
 pub enum Model {
     MrDo4,
     MrSi4,
+    MrAi8,
+    Relay8,
 }
 
 impl Model {
-    pub const ALL: [Model; 2] = [Model::MrDo4, Model::MrSi4];
+    pub const ALL: [Model; 4] = [Model::MrDo4, Model::MrSi4, Model::MrAi8, Model::Relay8];
 
     /// The identifier of the device's profile.
     pub const fn id(self) -> &'static str {
         match self {
             Model::MrDo4 => "metz-connect/mr-do4",
             Model::MrSi4 => "metz-connect/mr-si4",
+            Model::MrAi8 => "metz-connect/mr-ai8",
+            Model::Relay8 => "fuehlersysteme/relay8",
         }
     }
 
@@ -172,6 +178,8 @@ impl Model {
         match self {
             Model::MrDo4 => Box::new(MetzConnect::new(now, line, MrDo4::new(now))),
             Model::MrSi4 => Box::new(MetzConnect::new(now, line, MrSi4::new(now))),
+            Model::MrAi8 => Box::new(MetzConnect::new(now, line, MrAi8::new(now))),
+            Model::Relay8 => Box::new(Relay8::new(now)),
         }
     }
 }

@@ -1,10 +1,13 @@
 //! What all METZ CONNECT devices have in common: the manual's chapter "Allgemein geltende Kommandos"
-//! (Softwarebeschreibung Modbus RTU V2.1, pages 4 and 5), and the identification.
+//! (Softwarebeschreibung Modbus RTU V2.1, pages 3 to 5), and the identification.
 //!
 //! [`MetzConnect`] is that common part around a [`Module`], which is one device's own chapter.
 
+mod channel;
+pub mod mr_ai8;
 pub mod mr_do4;
 pub mod mr_si4;
+mod sensors;
 
 use crate::engine::time::Time;
 use crate::simulator::device::{
@@ -54,9 +57,9 @@ struct Counters {
     unanswered: u16,
 }
 
-/// Bit rate and parity (page 4).
+/// Bit rate and parity (page 3).
 const LINE_REGISTER: u16 = 65;
-/// Without this high byte register 65 is not written (page 4).
+/// Without this high byte register 65 is not written (page 3).
 const LINE_MAGIC: u8 = 0x53;
 const BAUD_RATES: [u32; 8] = [1200, 2400, 4800, 9600, 19200, 38400, 57600, 115_200];
 const PARITIES: [Parity; 3] = [Parity::Even, Parity::Odd, Parity::None];
@@ -89,7 +92,7 @@ impl<M: Module> MetzConnect<M> {
         }
     }
 
-    /// Register 65, "Bitrate einstellen über Modbus-Kommando" (page 4). Codes that are in no table
+    /// Register 65, "Bitrate einstellen über Modbus-Kommando" (page 3). Codes that are in no table
     /// are refused; the manual itself says only that nothing happens without the magic number.
     fn set_line(&mut self, word: u16) -> Result<(), Exception> {
         let [magic, codes] = word.to_be_bytes();
@@ -175,7 +178,7 @@ impl<M: Module> SimulatedDevice for MetzConnect<M> {
             None
         } else {
             // Elsewhere the manual says of such a timer: it starts anew with each valid message to
-            // the device, only the address matters (page 24). A broadcast is not addressed to it.
+            // the device, only the address matters (pages 13 and 27). A broadcast is not addressed to it.
             if addressed == Addressed::Unit {
                 self.module.message_for_this_device(now);
             }
@@ -314,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn register_65_sets_bit_rate_and_parity_only_with_its_magic_number_page_4() {
+    fn register_65_sets_bit_rate_and_parity_only_with_its_magic_number_page_3() {
         let settings = |baud, parity| Some(LineSettings { baud, parity });
         for (request, reply, now) in [
             // The manual's example: even parity, 19200.

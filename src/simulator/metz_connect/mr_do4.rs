@@ -70,7 +70,7 @@ impl MrDo4 {
     }
 }
 
-/// "Gültige Register Startadresse 0..1 oder 66, gültige Anzahl 2 oder 1" (pages 8 and 9).
+/// "Gültige Register Startadresse 0..1 oder 66, gültige Anzahl 2 oder 1" (pages 7 and 9).
 fn check_registers(first: u16, count: usize) -> Result<(), Exception> {
     let allowed = if first == WATCHDOG_REGISTER { (first, first) } else { (0, 1) };
     check_span(first, count, 2, allowed)
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn registers_are_0_1_and_66_and_not_across_pages_8_and_9() {
+    fn registers_are_0_1_and_66_and_not_across_pages_7_and_9() {
         check(&[
             ("10 0000 0002 04 0005 000A", "10 0000 0002"),
             ("03 0000 0002", "03 04 0005 000A"),

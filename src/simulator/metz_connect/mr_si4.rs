@@ -1,5 +1,5 @@
 //! MR-SI4: four pulse inputs with 48-bit counters and calculated meter readings (Softwarebeschreibung
-//! Modbus RTU V2.1, chapter MR-SI4).
+//! Modbus RTU V2.1, pages 16 to 20).
 
 use crate::engine::time::{Duration, Time};
 use crate::simulator::device::{Signal, Stimulus, take_words};
@@ -41,6 +41,8 @@ struct Input {
 #[derive(Clone, Copy, Debug)]
 struct Contact {
     closed: bool,
+    /// When the closing of a pulse ends.
+    opens_at: Option<Time>,
     last_counted: Option<Time>,
     /// Closings still to come, from this one on.
     next_pulse: Time,
@@ -48,6 +50,14 @@ struct Contact {
     every: Duration,
 }
 
+const OPEN: Contact = Contact {
+    closed: false,
+    opens_at: None,
+    last_counted: None,
+    next_pulse: Time(0),
+    remaining: 0,
+    every: PULSE_DISTANCE,
+};
 const INPUTS: usize = 4;
 /// "Alle 60 Millisekunden kann ein Impuls vom Stromzähler kommen": what comes faster is not counted.
 const PULSE_DISTANCE: Duration = Duration::from_millis(60);
@@ -66,14 +76,7 @@ const INPUT_LAST: u16 = 20;
 const EEPROM_WORDS: usize = 14;
 
 impl MrSi4 {
-    pub fn new(now: Time) -> MrSi4 {
-        let contact = Contact {
-            closed: false,
-            last_counted: None,
-            next_pulse: now,
-            remaining: 0,
-            every: PULSE_DISTANCE,
-        };
+    pub fn new(_now: Time) -> MrSi4 {
         let input = Input {
             pulses: 0,
             at_button: 0,
@@ -85,7 +88,7 @@ impl MrSi4 {
             digits: 7,
             decimals: 1,
             button_enabled: true,
-            contact,
+            contact: OPEN,
         };
         MrSi4 { inputs: [input; INPUTS] }
     }
@@ -152,23 +155,26 @@ impl Input {
     }
 
     fn advance(&mut self, now: Time) {
-        let contact = &mut self.contact;
-        if contact.remaining == 0 {
-            return;
-        }
-        while contact.remaining > 0 && contact.next_pulse <= now {
-            let at = contact.next_pulse;
-            if contact.last_counted.is_none_or(|last| at.since(last) >= PULSE_DISTANCE) {
-                self.pulses = self.pulses.wrapping_add(1) & COUNTER_MASK;
-                contact.last_counted = Some(at);
-            }
+        while self.contact.remaining > 0 && self.contact.next_pulse <= now {
+            let at = self.contact.next_pulse;
+            self.close(at);
+            let contact = &mut self.contact;
             contact.remaining -= 1;
-            contact.closed = now.since(at) < PULSE_LENGTH.min(contact.every / 2);
             contact.next_pulse = at + contact.every;
+            contact.opens_at = Some(at + PULSE_LENGTH.min(contact.every / 2));
         }
-        let last_closing = Time(contact.next_pulse.0.saturating_sub(contact.every.as_micros() as u64));
-        if now >= last_closing && now.since(last_closing) >= PULSE_LENGTH.min(contact.every / 2) {
-            contact.closed = false;
+        if self.contact.opens_at.is_some_and(|opens_at| opens_at <= now) {
+            self.contact.closed = false;
+            self.contact.opens_at = None;
+        }
+    }
+
+    /// The contact closes: that is what is counted.
+    fn close(&mut self, now: Time) {
+        self.contact.closed = true;
+        if self.contact.last_counted.is_none_or(|last| now.since(last) >= PULSE_DISTANCE) {
+            self.pulses = self.pulses.wrapping_add(1) & COUNTER_MASK;
+            self.contact.last_counted = Some(now);
         }
     }
 }
@@ -258,16 +264,15 @@ impl Module for MrSi4 {
             Stimulus::Input { input: number @ 1..=4, signal } => {
                 let input = &mut self.inputs[usize::from(number) - 1];
                 match signal {
-                    Signal::Open | Signal::Contact(false) => input.contact.closed = false,
+                    Signal::Open | Signal::Contact(false) => {
+                        input.contact = Contact { last_counted: input.contact.last_counted, ..OPEN };
+                    }
                     Signal::Contact(true) => {
                         if !input.contact.closed {
-                            input.contact.remaining = 1;
-                            input.contact.next_pulse = now;
-                            input.contact.every = PULSE_DISTANCE;
-                            input.advance(now);
+                            input.close(now);
                         }
                         input.contact.remaining = 0;
-                        input.contact.closed = true;
+                        input.contact.opens_at = None;
                     }
                     Signal::Pulses { count, every } if !every.is_zero() => {
                         input.contact.remaining = count;
@@ -310,3 +315,6 @@ impl Module for MrSi4 {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
