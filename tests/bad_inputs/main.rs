@@ -2,6 +2,8 @@
 //! `error.txt`. Adding a fault is adding a folder; `BLESS=1 cargo test --test bad_inputs` writes the
 //! messages, which a person then reads.
 
+mod anything;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 

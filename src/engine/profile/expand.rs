@@ -106,13 +106,13 @@ impl<'f> Expansion<'_, 'f> {
                 .add(&point.place, "the key `at` is missing here; expected a place like `at: input 32`");
         }
         for (_, child) in point.points.iter().flat_map(|children| children.iter()) {
-            if child.at.is_none() {
+            if child.at.is_none() && child.points.is_none() {
                 self.faults
                     .add(&child.place, "the key `at` is missing here; expected a place like `at: input 32`");
             }
         }
         if let (Some(step), None) = (&point.step, &point.r#for) {
-            self.faults.add(&step.place, "a `step` of a point that is there once; remove it, or add `for`");
+            self.faults.add(&step.place, "`step` of a point that is there once; remove it, or add `for`");
         }
     }
 

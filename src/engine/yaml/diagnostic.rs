@@ -158,7 +158,7 @@ pub struct Faults {
 impl Faults {
     /// Notes a fault; the same one at the same place is noted once.
     pub fn add(&mut self, place: &Place, message: impl Into<String>) {
-        let diagnostic = Diagnostic { place: place.clone(), message: message.into() };
+        let diagnostic = Diagnostic { place: place.clone(), message: one_line(message.into()) };
         if !self.list.contains(&diagnostic) {
             self.list.push(diagnostic);
         }
@@ -201,4 +201,16 @@ impl fmt::Display for Faults {
         let shown: Vec<String> = self.clone().into_sorted().iter().map(Diagnostic::to_string).collect();
         write!(f, "{}", shown.join("\n"))
     }
+}
+
+/// A message that quotes a text of several lines is one line all the same.
+fn one_line(message: String) -> String {
+    if !message.contains(char::is_control) {
+        return message;
+    }
+    let visible = |character: char| match character.is_control() {
+        true => character.escape_default().to_string(),
+        false => character.to_string(),
+    };
+    message.chars().map(visible).collect()
 }

@@ -65,7 +65,7 @@ pub use parse::parse;
 pub use read::{At, KeySchema, Keys, Map, Read, Record, list_of_choices, nearest, read};
 pub use record::{choices, record};
 pub use scalar::Scalar;
-pub use schema::{Definitions, schema_of};
+pub use schema::{Definitions, schema_of, schema_of_choices};
 pub use serde_json::Value as Json;
 
 #[cfg(test)]

@@ -103,9 +103,7 @@ macro_rules! choices {
             }
 
             fn schema() -> $crate::engine::yaml::Json {
-                $crate::engine::yaml::Json::from_iter([
-                    ("enum", $crate::engine::yaml::Json::from_iter([$($word),*])),
-                ])
+                $crate::engine::yaml::schema_of_choices(&[$($word),*])
             }
         }
     };

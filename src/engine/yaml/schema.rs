@@ -34,3 +34,10 @@ pub fn schema_of<T: Read>(title: &str) -> Json {
     }
     schema
 }
+
+/// One of these words; a word that looks like a number is one to editors.
+pub fn schema_of_choices(words: &[&str]) -> Json {
+    let choices: Vec<Json> =
+        words.iter().map(|word| word.parse::<i64>().map_or_else(|_| Json::from(*word), Json::from)).collect();
+    json!({"enum": choices})
+}

@@ -28,8 +28,10 @@ impl Rules<'_, '_> {
                     self.faults
                         .add(&step.place, format!("`{key}_step` without `{key}`; remove it, or add `{key}`"));
                 } else if expanded.repetition.is_none() {
-                    self.faults
-                        .add(&step.place, format!("a `{key}_step` of a point that is there once; remove it"));
+                    self.faults.add(
+                        &step.place,
+                        format!("`{key}_step` of a point that is there once; remove it, or add `for`"),
+                    );
                 }
             }
         }
@@ -61,38 +63,32 @@ impl Rules<'_, '_> {
     }
 
     fn no_point_is_in_a_forbidden_span(&mut self) {
-        for fault in self.once_per_entry(|rules, subject| {
-            let forbidden = &rules.device.wire.forbidden;
-            places(subject).into_iter().find_map(|(place, address, _)| {
+        let forbidden = &self.device.wire.forbidden;
+        self.once_per_entry(|points, index| {
+            places(points[index]).into_iter().find_map(|(place, address, _)| {
                 let found = forbidden.iter().find(|forbidden| forbidden.span.overlaps(address.span))?;
                 Some((place, format!(
                     "`{}` would lie at {address}, but {} is forbidden ({}); expected another place, or a smaller forbidden span",
-                    subject.expanded.name, found.span, found.reason
+                    points[index].point.name, found.span, found.reason
                 )))
             })
-        }) {
-            self.faults.add(&fault.0, fault.1);
-        }
+        });
     }
 
     fn what_is_read_is_readable(&mut self) {
-        for fault in self.once_per_entry(|rules, subject| {
-            let readable = &rules.device.wire.readable;
-            if readable.is_empty() || subject.file.press.is_some() {
+        let readable = &self.device.wire.readable;
+        self.once_per_entry(|points, index| {
+            if readable.is_empty() {
                 return None;
             }
-            places(subject).into_iter().filter(|(_, _, is_read)| *is_read).find_map(|(place, address, _)| {
-                if readable.iter().any(|span| span.contains(address.span)) {
-                    return None;
-                }
-                Some((place, format!(
-                    "`{}` would lie at {address}, which is in none of the `readable` spans; expected another place, or a wider span there",
-                    subject.expanded.name
-                )))
-            })
-        }) {
-            self.faults.add(&fault.0, fault.1);
-        }
+            let is_reached = |address: Address| readable.iter().any(|span| span.contains(address.span));
+            let missed = |(_, address, is_read): &(Place, Address, bool)| *is_read && !is_reached(*address);
+            let (place, address, _) = places(points[index]).into_iter().find(missed)?;
+            Some((place, format!(
+                "`{}` would lie at {address}, which is in none of the `readable` spans; expected another place, or a wider span there",
+                points[index].point.name
+            )))
+        });
     }
 
     fn no_value_is_wider_than_a_request(&mut self) {
@@ -118,9 +114,9 @@ impl Rules<'_, '_> {
     }
 
     fn writable_points_do_not_overlap(&mut self) {
-        let points = self.all();
-        for (index, subject) in points.iter().enumerate() {
-            let Some(write) = &subject.point.write else { continue };
+        self.once_per_entry(|points, index| {
+            let subject = points[index];
+            let write = subject.point.write.as_ref()?;
             let is_press = matches!(write.rule, WriteRule::Press { .. });
             let clash = points[..index].iter().find(|other| {
                 other.point.write.as_ref().is_some_and(|other| {
@@ -128,65 +124,47 @@ impl Rules<'_, '_> {
                     let both_press = is_press && matches!(other.rule, WriteRule::Press { .. });
                     other.at.overlaps(write.at) && !both_press
                 })
-            });
-            if let Some(other) = clash {
-                let place = subject.file.write_at.as_ref().or(subject.file.at.as_ref()).map(|at| &at.place);
-                self.faults.add(
-                    place.unwrap_or(subject.expanded.place),
-                    format!(
-                        "`{}` is written at {}, where `{}` (line {}) is written too; expected one of them, or fields of bits that do not overlap",
-                        subject.point.name,
-                        write.at,
-                        other.point.name,
-                        other.expanded.place.line()
-                    ),
-                );
-                return;
-            }
-        }
+            })?;
+            let key = subject.file.write_at.as_ref().or(subject.file.at.as_ref())?;
+            Some((key.place.clone(), format!(
+                "`{}` is written at {}, where `{}` (line {}) is written too; expected one of them, or fields of bits that do not overlap",
+                subject.point.name, write.at, clash.point.name, clash.expanded.place.line()
+            )))
+        });
     }
 
     fn no_register_is_read_as_two_points(&mut self) {
-        let points: Vec<Subject<'_, '_>> = self
-            .all()
-            .into_iter()
-            .filter(|subject| subject.file.press.is_none() && subject.point.at.bits.is_none())
-            .collect();
-        for (index, subject) in points.iter().enumerate() {
+        let is_read_whole =
+            |subject: &Subject<'_, '_>| subject.file.press.is_none() && subject.point.at.bits.is_none();
+        self.once_per_entry(|points, index| {
+            let subject = points[index];
             let at = subject.point.at;
-            let clash = points[..index].iter().find(|other| {
+            let clash = points[..index].iter().filter(|_| is_read_whole(&subject)).find(|other| {
                 // Two writable ones are told of already.
-                other.point.at.overlaps(at) && (other.point.write.is_none() || subject.point.write.is_none())
-            });
-            if let (Some(other), Some(key)) = (clash, &subject.file.at) {
-                self.faults.add(
-                    &key.place,
-                    format!(
-                        "`{}` at {at} reads what `{}` (line {}) reads too; expected one of them, or fields of bits",
-                        subject.point.name,
-                        other.point.name,
-                        other.expanded.place.line()
-                    ),
-                );
-                return;
-            }
-        }
+                let both_written = other.point.write.is_some() && subject.point.write.is_some();
+                is_read_whole(other) && other.point.at.overlaps(at) && !both_written
+            })?;
+            let key = subject.file.at.as_ref()?;
+            Some((key.place.clone(), format!(
+                "`{}` at {at} reads what `{}` (line {}) reads too; expected one of them, or fields of bits",
+                subject.point.name, clash.point.name, clash.expanded.place.line()
+            )))
+        });
     }
 
-    /// The first fault that `rule` finds among the repetitions of each entry.
-    fn once_per_entry(
-        &self,
-        rule: impl Fn(&Self, Subject<'_, '_>) -> Option<(Place, String)>,
-    ) -> Vec<(Place, String)> {
-        let mut found: Vec<(Place, String)> = Vec::new();
-        for subject in self.all() {
-            if let Some(fault) = rule(self, subject) {
-                if !found.iter().any(|(place, _)| *place == fault.0) {
-                    found.push(fault);
+    /// Notes the first fault that `rule` finds among the repetitions of each entry.
+    fn once_per_entry(&mut self, rule: impl Fn(&[Subject<'_, '_>], usize) -> Option<(Place, String)>) {
+        let points = self.all();
+        let mut told: Vec<Place> = Vec::new();
+        for index in 0..points.len() {
+            match rule(&points, index) {
+                Some((place, message)) if !told.contains(&place) => {
+                    self.faults.add(&place, message);
+                    told.push(place);
                 }
+                _ => {}
             }
         }
-        found
     }
 }
 
