@@ -14,6 +14,7 @@
 mod by_hand;
 mod check;
 pub mod configuration;
+mod demo;
 pub mod log;
 pub mod output;
 mod plan;
@@ -44,6 +45,7 @@ macro_rules! verbs {
 
 verbs! {
     check Check,
+    demo Demo,
     plan Plan,
     profiles Profiles,
     read Read,

@@ -38,6 +38,7 @@ pub struct App {
     buses: Arc<Vec<BusHandle>>,
     broker: Broker,
     http: Option<Http>,
+    reporter: Arc<Reporter>,
     watch: JoinHandle<()>,
 }
 
@@ -69,13 +70,18 @@ impl App {
         let first = (0..buses.len()).map(|index| Bus::new(clock.now(), &settings, index).report(clock.now()));
         let reporter = Arc::new(Reporter::new(broker.state(), questions(&buses), first.collect()));
         let http = listener.map(|listener| Http::serve(listener, reporter.clone(), clock));
-        let watch = tokio::spawn(watch(reporter, topics, mailbox));
-        Ok(App { runtime, buses, broker, http, watch })
+        let watch = tokio::spawn(watch(reporter.clone(), topics, mailbox));
+        Ok(App { runtime, buses, broker, http, reporter, watch })
     }
 
     /// Where HTTP listens, if it does.
     pub fn http_address(&self) -> Option<SocketAddr> {
         self.http.as_ref().map(Http::address)
+    }
+
+    /// The gateway as it is now. Not from within a runtime.
+    pub fn report(&self) -> GatewayReport {
+        self.runtime.block_on(self.reporter.report())
     }
 
     /// Waits for SIGTERM or SIGINT.

@@ -7,6 +7,7 @@ use std::process::{Command, Output};
 
 /// Who runs each command that README.md shows.
 const README_COMMANDS: &[(&str, RunBy)] = &[
+    ("make demo", RunBy::Test("tests/demo/main.rs")),
     ("make test", RunBy::Gate),
     ("cargo build --release", RunBy::Gate),
     ("busker check --config deploy/busker.yaml", RunBy::Here),
@@ -17,6 +18,8 @@ enum RunBy {
     Here,
     /// `.ci/run`
     Gate,
+    /// Another test, which names it in its first lines.
+    Test(&'static str),
 }
 
 #[test]
@@ -35,6 +38,7 @@ fn every_command_of_the_readme_is_run_by_a_test() {
                 let arguments: Vec<&str> = command.split(' ').skip(1).collect();
                 good(&busker(&arguments));
             }
+            RunBy::Test(file) => assert!(read(file).contains(command), "{file} does not run `{command}`"),
             RunBy::Gate => assert!(read(".ci/run").contains(command), ".ci/run does not run `{command}`"),
         }
     }

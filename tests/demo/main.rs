@@ -1,0 +1,199 @@
+//! `make demo` as a newcomer does it: start it, read what it prints, do what it says, interrupt it.
+
+use std::io::{BufRead, BufReader};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, kill_process, kill_process_group};
+
+/// Far longer than anything here takes; only a failing test waits for it.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+const DEVICES: [&str; 4] =
+    ["metz_connect_mr_do4", "metz_connect_mr_ai8", "metz_connect_mr_si4", "fuehlersysteme_relay8"];
+
+#[test]
+fn make_demo_shows_live_values_and_its_three_commands_do_what_they_say() {
+    let temporary = tempfile::tempdir().expect("a temporary folder");
+    let mut command = Command::new("make");
+    command.args(["--silent", "demo"]).env("TMPDIR", temporary.path());
+    // A make within a make would ask the outer one how many jobs it may run.
+    for variable in ["MAKEFLAGS", "MFLAGS", "MAKELEVEL"] {
+        command.env_remove(variable);
+    }
+    let mut demo = Demo::start(&mut command);
+    let introduction = demo.introduction();
+
+    for device in DEVICES {
+        demo.wait_for(&format!("{device} is online"), |line| line == format!("{device} online"));
+    }
+    let health = ureq::get(&introduction.health).call().expect("health is answered");
+    assert_eq!(health.status(), 200);
+    let health: serde_json::Value =
+        serde_json::from_reader(health.into_body().into_reader()).expect("health is JSON");
+    assert_eq!(health["status"], "ok", "{health}");
+
+    let mut watch = Demo::start(Command::new("sh").arg("-c").arg(format!("exec {}", introduction.watch)));
+    watch.wait_for("the bridge", |line| line == "busker/bridge/state online");
+    watch.wait_for("a relay", |line| line == "busker/metz_connect_mr_do4/relay_1 OFF");
+
+    shell(&introduction.switch);
+    demo.wait_for("the relay on", |line| line == "metz_connect_mr_do4/relay_1 ON");
+    watch.wait_for("the relay on", |line| line == "busker/metz_connect_mr_do4/relay_1 ON");
+    watch.wait_for("the outcome", |line| {
+        line.starts_with("busker/metz_connect_mr_do4/relay_1/outcome ") && line.contains("\"done\"")
+    });
+
+    shell(&introduction.change);
+    demo.wait_for("degrees", |line| {
+        line.starts_with("metz_connect_mr_ai8/channel_1_value 2") && line.ends_with(" °C")
+    });
+
+    demo.signal_group(Signal::INT);
+    let status = demo.wait();
+    watch.wait_for("the last word", |line| line == "busker/bridge/state offline");
+    drop(watch);
+    // make says that it was interrupted; everything below it ended well.
+    assert!(status.code() == Some(0) || status.code() == Some(2) || status.signal() == Some(2), "{status:?}");
+    assert!(TcpStream::connect(introduction.broker).is_err(), "the broker is still there");
+    let left: Vec<_> = temporary.path().read_dir().expect("a folder").collect();
+    assert!(left.is_empty(), "{left:?}");
+}
+
+#[test]
+fn a_request_to_terminate_ends_it_well() {
+    let mut demo = Demo::start(Command::new(env!("CARGO_BIN_EXE_busker")).arg("demo"));
+    let introduction = demo.introduction();
+    demo.wait_for("a value", |line| line.starts_with("metz_connect_mr_do4/relay_1 "));
+    demo.signal(Signal::TERM);
+    assert_eq!(demo.wait().code(), Some(0));
+    assert!(TcpStream::connect(introduction.broker).is_err(), "the broker is still there");
+}
+
+#[test]
+fn a_killed_demo_takes_its_broker_with_it() {
+    let mut demo = Demo::start(Command::new(env!("CARGO_BIN_EXE_busker")).arg("demo"));
+    let introduction = demo.introduction();
+    demo.signal(Signal::KILL);
+    demo.wait();
+    let gone = (0..1000).any(|_| {
+        // Nobody tells us when a stranger's child has ended; so it is asked again and again.
+        std::thread::sleep(Duration::from_millis(10));
+        TcpStream::connect(introduction.broker).is_err()
+    });
+    assert!(gone, "the broker is still there");
+}
+
+#[test]
+fn a_port_that_is_taken_is_said_and_nothing_is_left() {
+    let taken = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = taken.local_addr().expect("its address").to_string();
+    for option in ["--mqtt", "--http"] {
+        let output = Command::new(env!("CARGO_BIN_EXE_busker"))
+            .args(["demo", option, &address])
+            .output()
+            .expect("the program starts");
+        assert_eq!(output.status.code(), Some(1), "{option}: {output:?}");
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert!(told.contains("error: ") && told.contains(&address), "{option}: {told}");
+    }
+}
+
+/// What the first lines say.
+struct Introduction {
+    broker: SocketAddr,
+    health: String,
+    watch: String,
+    switch: String,
+    change: String,
+}
+
+/// A running program whose lines are read. It is killed with its group if the test fails.
+struct Demo {
+    child: Child,
+    lines: Receiver<String>,
+    seen: Vec<String>,
+}
+
+impl Demo {
+    fn start(command: &mut Command) -> Demo {
+        let mut child = command
+            .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")))
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .process_group(0)
+            .spawn()
+            .expect("it starts");
+        let stdout = child.stdout.take().expect("its output");
+        let (sender, lines) = channel();
+        std::thread::spawn(move || {
+            for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+                if sender.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        Demo { child, lines, seen: Vec::new() }
+    }
+
+    fn introduction(&mut self) -> Introduction {
+        let broker = self.wait_for("the broker", |line| line.starts_with("broker "));
+        let broker = broker.split("mqtt://").nth(1).expect("an address").parse().expect("an address");
+        let health = self.wait_for("health", |line| line.starts_with("health "));
+        let health = health.split_whitespace().nth(1).expect("an address").to_string();
+        let mut after = |label: &str| {
+            self.wait_for(label, |line| line == label);
+            self.wait_for("the command", |_| true)
+        };
+        let watch = after("watch everything:");
+        let switch = after("switch a relay:");
+        let change = after("change an input's sensor type:");
+        Introduction { broker, health, watch, switch, change }
+    }
+
+    /// The next line that fits.
+    fn wait_for(&mut self, what: &str, fits: impl Fn(&str) -> bool) -> String {
+        loop {
+            match self.lines.recv_timeout(PATIENCE) {
+                Ok(line) if fits(&line) => return line,
+                Ok(line) => self.seen.push(line),
+                Err(error) => panic!("{what} did not come ({error}); seen:\n{}", self.seen.join("\n")),
+            }
+        }
+    }
+
+    fn pid(&self) -> Pid {
+        Pid::from_child(&self.child)
+    }
+
+    fn signal(&self, signal: Signal) {
+        kill_process(self.pid(), signal).expect("it can be signalled");
+    }
+
+    /// As a terminal does it: everything in the foreground gets the signal.
+    fn signal_group(&self, signal: Signal) {
+        kill_process_group(self.pid(), signal).expect("it can be signalled");
+    }
+
+    fn wait(&mut self) -> ExitStatus {
+        self.child.wait().expect("it ends")
+    }
+}
+
+impl Drop for Demo {
+    fn drop(&mut self) {
+        if matches!(self.child.try_wait(), Ok(None)) {
+            let _ = kill_process_group(self.pid(), Signal::KILL);
+            let _ = self.child.wait();
+        }
+    }
+}
+
+fn shell(command: &str) {
+    let status = Command::new("sh").arg("-c").arg(command).status().expect("a shell");
+    assert!(status.success(), "{command}");
+}
