@@ -26,7 +26,7 @@ pub struct ByHand {
     /// The device's name in the configuration
     #[arg(long, value_name = "NAME", requires = "config")]
     device: Option<String>,
-    /// The device's unit on the line
+    /// The device's unit on the line; 0 writes to all units of an RTU line
     #[arg(long, value_name = "UNIT", conflicts_with = "config")]
     unit: Option<u8>,
     /// The line's bit rate
@@ -73,6 +73,8 @@ fn parity(name: &str) -> Result<Parity, String> {
 pub struct Asked {
     link: GuardedLink,
     unit: u8,
+    /// Unit 0 is every unit: on RTU, but not on Modbus TCP.
+    broadcasts: bool,
     timeout: Duration,
     /// Its profile, where the configuration names one.
     pub device: Option<Device>,
@@ -98,8 +100,8 @@ impl ByHand {
             _ => return self.open_configured(),
         };
         let unit = self.unit.unwrap_or_default();
-        if !matches!(link, settings::Link::Tcp { .. }) && !(1..=247).contains(&unit) {
-            return Err(Failure::wrong(format!("unit {unit} cannot be asked; expected 1 to 247")));
+        if !matches!(link, settings::Link::Tcp { .. }) && unit > 247 {
+            return Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")));
         }
         open(&link, None, unit, self.timeout, None)
     }
@@ -130,8 +132,9 @@ fn open(
     device: Option<Device>,
 ) -> Result<Asked, Failure> {
     let opened = Link::open(link).map_err(|lost| anyhow!("{lost}"))?;
+    let broadcasts = !matches!(link, settings::Link::Tcp { .. });
     let link = GuardedLink::new(opened, Guard::new(link, gap), Clock::start());
-    Ok(Asked { link, unit, timeout, device })
+    Ok(Asked { link, unit, broadcasts, timeout, device })
 }
 
 fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
@@ -149,6 +152,11 @@ fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
 impl Asked {
     pub fn unit(&self) -> u8 {
         self.unit
+    }
+
+    /// Whether what is asked goes to all units of the line, of which none answers.
+    pub fn is_broadcast(&self) -> bool {
+        self.unit == 0 && self.broadcasts
     }
 
     /// One question. `Err` outside: the line is lost.

@@ -70,6 +70,11 @@ pub fn run(args: Args) -> Result<(), Failure> {
 }
 
 fn write_words(device: &mut Asked, span: Span, words: &[u16], call: &Call) -> Result<(), Failure> {
+    if device.is_broadcast() {
+        device.ask(call)?.map_err(|error| anyhow!("{error}"))?;
+        eprintln!("sent to all units; none answers");
+        return Ok(());
+    }
     // Also to learn whether the line returns what we send: a write's echo looks like its reply.
     match device.ask(&Call::Read(span))? {
         Ok(answer) => eprintln!("before:\n{}", as_text(span, &words_of(&answer))),

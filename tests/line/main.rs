@@ -1,0 +1,360 @@
+//! The whole program on lines that misbehave: whatever comes, nothing false is published, each
+//! fault is counted as what it was, and the next reading is right.
+
+mod peer;
+#[path = "../support/mod.rs"]
+mod support;
+
+use std::process::{Command, Output};
+
+use peer::{Asked, Framing, Misbehave, Peer, Step, read_pdu, reply, rtu};
+use serde_json::Value;
+use support::{Busker, Mosquitto, Observer, program, wait_for};
+
+/// What no device ever holds.
+const LIE: u16 = 9999;
+
+/// How long the gateway waits for a reply, and then for a late one, in milliseconds.
+const TIMEOUT: u64 = 250;
+
+/// The counters that a fault may raise; the others follow the polls.
+const FAULTS: [&str; 8] = [
+    "timeouts",
+    "checksum_errors",
+    "wrong_frames",
+    "exceptions",
+    "late_replies",
+    "foreign_frames",
+    "echoes",
+    "noise_bytes",
+];
+
+/// What is done to one reply, and what that counts as.
+struct Fault {
+    name: &'static str,
+    how: Misbehave,
+    counts: &'static [(&'static str, u64)],
+}
+
+const RTU_FAULTS: &[Fault] = &[
+    Fault { name: "silence", how: |_, _| vec![], counts: &[("timeouts", 1)] },
+    Fault {
+        name: "a late reply before the next request",
+        how: |asked, _| vec![Step::Pause(TIMEOUT + 100), Step::Say(lie(asked))],
+        counts: &[("timeouts", 1), ("late_replies", 1)],
+    },
+    Fault {
+        name: "a late reply after the next request",
+        how: |asked, _| vec![Step::SayBeforeNext(lie(asked))],
+        counts: &[("timeouts", 1), ("late_replies", 1)],
+    },
+    Fault {
+        name: "a different count",
+        how: |asked, _| vec![Step::Say(rtu(asked.unit, &read_pdu(4, &[LIE, LIE])))],
+        counts: &[("wrong_frames", 1), ("foreign_frames", 1)],
+    },
+    Fault {
+        name: "another function",
+        how: |asked, _| vec![Step::Say(rtu(asked.unit, &read_pdu(3, &[LIE])))],
+        counts: &[("wrong_frames", 1), ("foreign_frames", 1)],
+    },
+    Fault {
+        name: "a wrong checksum",
+        how: |asked, _| vec![Step::Say(changed(lie(asked), |frame| frame[6] ^= 0x10))],
+        counts: &[("checksum_errors", 1)],
+    },
+    Fault {
+        name: "a wrong checksum, cut short",
+        how: |asked, _| vec![Step::Say(changed(lie(asked), |frame| frame.truncate(4)))],
+        counts: &[("checksum_errors", 1)],
+    },
+    Fault {
+        name: "a wrong checksum, a byte too many",
+        how: |asked, _| vec![Step::Say(changed(lie(asked), |frame| frame.insert(4, 0x55)))],
+        counts: &[("checksum_errors", 1)],
+    },
+    Fault {
+        name: "30 noise bytes first",
+        how: |_, good| vec![Step::Say([noise(30), good].concat())],
+        counts: &[("noise_bytes", 30)],
+    },
+    Fault {
+        name: "noise behind",
+        how: |_, good| vec![Step::Say([good, noise(3)].concat())],
+        counts: &[("noise_bytes", 3)],
+    },
+    Fault {
+        name: "a zero byte first",
+        how: |_, good| vec![Step::Say([vec![0], good].concat())],
+        counts: &[("noise_bytes", 1)],
+    },
+    Fault { name: "single bytes", how: |_, good| in_single_bytes(good), counts: &[] },
+    Fault {
+        name: "another unit's reply first",
+        how: |_, good| vec![Step::Say(rtu(9, &read_pdu(4, &[LIE]))), Step::Pause(10), Step::Say(good)],
+        counts: &[("foreign_frames", 1)],
+    },
+    Fault {
+        name: "only another unit's reply",
+        how: |_, _| vec![Step::Say(rtu(9, &read_pdu(4, &[LIE])))],
+        counts: &[("wrong_frames", 1), ("foreign_frames", 1)],
+    },
+    Fault {
+        name: "somebody's broadcast first",
+        how: |_, good| vec![Step::Say(rtu(0, &[6, 0, 0, 0x27, 0x0F])), Step::Pause(10), Step::Say(good)],
+        counts: &[("foreign_frames", 1)],
+    },
+    Fault {
+        name: "an echo of the request first",
+        how: |asked, good| vec![Step::Say(asked.frame.clone()), Step::Pause(5), Step::Say(good)],
+        counts: &[("echoes", 1)],
+    },
+    Fault {
+        name: "an echo and nothing else",
+        how: |asked, _| vec![Step::Say(asked.frame.clone())],
+        counts: &[("timeouts", 1), ("echoes", 1)],
+    },
+];
+
+const TCP_FAULTS: &[Fault] = &[
+    Fault { name: "silence", how: |_, _| vec![], counts: &[("timeouts", 1)] },
+    Fault {
+        name: "a late reply",
+        how: |asked, _| vec![Step::Pause(TIMEOUT + 100), Step::Say(tcp_lie(asked))],
+        counts: &[("timeouts", 1), ("late_replies", 1)],
+    },
+    Fault {
+        name: "a late reply after the next request",
+        how: |asked, _| vec![Step::SayBeforeNext(tcp_lie(asked))],
+        counts: &[("timeouts", 1), ("late_replies", 1)],
+    },
+    Fault {
+        name: "a different count",
+        how: |asked, _| vec![Step::Say(reply(asked, Framing::Tcp, &read_pdu(4, &[LIE, LIE])))],
+        counts: &[("wrong_frames", 1), ("foreign_frames", 1)],
+    },
+    Fault {
+        name: "another unit",
+        how: |asked, _| vec![Step::Say(changed(tcp_lie(asked), |frame| frame[6] = 9))],
+        counts: &[("wrong_frames", 1), ("foreign_frames", 1)],
+    },
+    Fault {
+        name: "another transaction first",
+        how: |asked, good| {
+            vec![Step::Say([changed(tcp_lie(asked), |frame| frame[0] ^= 0x80), good].concat())]
+        },
+        counts: &[("foreign_frames", 1)],
+    },
+    Fault { name: "single bytes", how: |_, good| in_single_bytes(good), counts: &[] },
+];
+
+fn lie(asked: &Asked) -> Vec<u8> {
+    rtu(asked.unit, &read_pdu(4, &[LIE]))
+}
+
+fn tcp_lie(asked: &Asked) -> Vec<u8> {
+    reply(asked, Framing::Tcp, &read_pdu(4, &[LIE]))
+}
+
+fn changed(mut frame: Vec<u8>, change: fn(&mut Vec<u8>)) -> Vec<u8> {
+    change(&mut frame);
+    frame
+}
+
+fn noise(count: u8) -> Vec<u8> {
+    (0..count).map(|index| 0x80 + 4 * index).collect()
+}
+
+fn in_single_bytes(frame: Vec<u8>) -> Vec<Step> {
+    frame.into_iter().flat_map(|byte| [Step::Pause(3), Step::Say(vec![byte])]).collect()
+}
+
+#[test]
+fn on_a_serial_line_every_fault_is_counted_and_none_is_believed() {
+    check_faults(&Peer::on_a_pseudo_terminal(), RTU_FAULTS);
+}
+
+#[test]
+fn through_a_serial_server_every_fault_is_counted_and_none_is_believed() {
+    check_faults(&Peer::on_tcp(Framing::Rtu), RTU_FAULTS);
+}
+
+#[test]
+fn on_modbus_tcp_every_fault_is_counted_and_none_is_believed() {
+    check_faults(&Peer::on_tcp(Framing::Tcp), TCP_FAULTS);
+}
+
+/// Each fault happens once to a read of `busker/one/a`, which rises by one at the same time. The
+/// other points of the same shape stay as they are: nothing of `a` may be told as theirs.
+fn check_faults(peer: &Peer, faults: &[Fault]) {
+    let gateway = Gateway::start(peer);
+    let mut truth = 100;
+    gateway.observer.wait_for("busker/one/a", "100");
+    gateway.observer.wait_for("busker/one/b", "500");
+    gateway.observer.wait_for("busker/two/a", "700");
+    let start = gateway.counters();
+    let mut expected: Vec<u64> = start.clone();
+    for fault in faults {
+        truth += 1;
+        peer.misbehave_once(1, 4, 0, fault.how);
+        peer.hold(1, 4, 0, truth);
+        wait_for(fault.name, || peer.has_misbehaved().then_some(()));
+        gateway.observer.wait_for("busker/one/a", &truth.to_string());
+        for (name, count) in fault.counts {
+            let index = FAULTS.iter().position(|fault| fault == name).expect("a counter");
+            expected[index] += count;
+        }
+        let mut found = Vec::new();
+        let reached = support::find(|| {
+            found = gateway.counters();
+            (found == expected).then_some(())
+        });
+        assert!(reached.is_some(), "{}:\n{}", fault.name, told(&found, &expected));
+    }
+    // Not one more, also after the last.
+    let from = gateway.observer.count();
+    peer.hold(1, 4, 100, 501);
+    gateway.observer.wait_for_next("busker/one/b", from);
+    assert_eq!(gateway.counters(), expected);
+
+    let told_of_a = gateway.values("busker/one/a");
+    let rising: Vec<u64> = (100..=u64::from(truth)).collect();
+    assert_eq!(told_of_a, rising, "every value once and in order, nothing else");
+    assert_eq!(gateway.values("busker/one/b"), [500, 501]);
+    assert_eq!(gateway.values("busker/two/a"), [700]);
+}
+
+fn told(found: &[u64], expected: &[u64]) -> String {
+    let rows = FAULTS.iter().zip(found).zip(expected);
+    rows.map(|((name, found), expected)| format!("{name}: {found}, expected {expected}\n")).collect()
+}
+
+#[test]
+fn a_write_is_not_confirmed_by_its_own_echo() {
+    let peer = Peer::on_a_pseudo_terminal();
+    peer.misbehave(|asked, good| vec![Step::Say(asked.frame.clone()), Step::Pause(4), Step::Say(good)]);
+    let gateway = Gateway::start(&peer);
+    gateway.observer.wait_for("busker/one/relay", "OFF");
+    assert_eq!(gateway.set_relay("ON")["outcome"], "done");
+    gateway.observer.wait_for("busker/one/relay", "ON");
+
+    // The unit does not hear writes any more, but the adapter still returns them.
+    peer.be_deaf_to_writes();
+    let outcome = gateway.set_relay("OFF");
+    assert_ne!(outcome["outcome"], "done", "{outcome}");
+    peer.hold(1, 4, 0, 101);
+    gateway.observer.wait_for("busker/one/a", "101");
+    let told: Vec<String> = gateway.observer.payloads("busker/one/relay");
+    assert_eq!(told.last().map(String::as_str), Some("ON"), "{told:?}");
+    assert_eq!(told.iter().filter(|payload| *payload == "OFF").count(), 1, "only at first: {told:?}");
+}
+
+#[test]
+fn an_adapter_may_be_unplugged_and_plugged_in_again() {
+    let peer = Peer::on_a_pseudo_terminal();
+    let gateway = Gateway::start(&peer);
+    gateway.observer.wait_for("busker/one/a", "100");
+    for truth in [101, 102] {
+        peer.unplug();
+        gateway.observer.wait_for("busker/one/availability", "offline");
+        let reason = wait_for("the bus to be down", || {
+            let bus = gateway.bus()?;
+            (bus["up"] == false).then(|| bus["reason"].as_str().unwrap_or_default().to_owned())
+        });
+        assert!(reason == "unplugged" || reason.contains("is the adapter plugged in?"), "{reason}");
+        peer.hold(1, 4, 0, truth);
+        peer.plug_in();
+        gateway.observer.wait_for("busker/one/availability", "online");
+        gateway.observer.wait_for("busker/one/a", &truth.to_string());
+    }
+    assert_eq!(gateway.values("busker/one/a"), [100, 101, 102]);
+}
+
+#[test]
+fn a_broadcast_is_sent_and_nobody_is_waited_for() {
+    let peer = Peer::on_a_pseudo_terminal();
+    let path = peer.path().display().to_string();
+    let line = ["--serial", &path, "--baud", "115200", "--parity", "none"];
+    let output = by_hand("write", &line, &["--unit", "0", "holding 7", "135"]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(peer.asked().len(), 1);
+    assert_eq!(peer.asked()[0].frame, rtu(0, &[6, 0, 7, 0, 135]));
+    let refused = by_hand("read", &line, &["--unit", "0", "holding 7"]);
+    assert_eq!(refused.status.code(), Some(2), "{refused:?}");
+    assert_eq!(peer.asked().len(), 1);
+    peer.hold(1, 3, 7, 4711);
+    let read = by_hand("read", &line, &["--unit", "1", "holding 7"]);
+    assert!(String::from_utf8_lossy(&read.stdout).contains("4711"), "{read:?}");
+}
+
+fn by_hand(verb: &str, line: &[&str], rest: &[&str]) -> Output {
+    Command::new(program()).arg(verb).args(line).args(rest).output().expect("the program is built")
+}
+
+/// The program on a peer's line, with two devices of a few points.
+struct Gateway {
+    // In the order in which they end.
+    busker: Busker,
+    observer: Observer,
+    _broker: Mosquitto,
+}
+
+impl Gateway {
+    fn start(peer: &Peer) -> Gateway {
+        peer.hold(1, 4, 0, 100);
+        peer.hold(1, 4, 100, 500);
+        peer.hold(2, 4, 0, 700);
+        let broker = Mosquitto::start();
+        let observer = Observer::of(&broker);
+        let configuration = format!(
+            "home_assistant: {{discovery: false}}
+buses:
+  line: {{{}, response_timeout: {TIMEOUT}ms}}
+devices:
+  one:
+    bus: line
+    unit: 1
+    poll: {{fast: 100ms}}
+    wire: {{limits: {{gap: 0}}}}
+    points:
+      a: {{at: input 0, poll: fast}}
+      b: {{at: input 100, poll: fast}}
+      relay: {{at: coil 0, poll: fast, write: any}}
+  two:
+    bus: line
+    unit: 2
+    poll: {{fast: 100ms}}
+    points: {{a: {{at: input 0, poll: fast}}}}
+",
+            peer.link()
+        );
+        let busker = Busker::run(&broker, &configuration);
+        Gateway { busker, observer, _broker: broker }
+    }
+
+    fn bus(&self) -> Option<Value> {
+        self.busker.json("/api/buses")?.get(0).cloned()
+    }
+
+    /// In the order of [`FAULTS`].
+    fn counters(&self) -> Vec<u64> {
+        let bus = wait_for("the API", || self.bus());
+        FAULTS.iter().map(|name| bus[name].as_u64().expect("a counter")).collect()
+    }
+
+    /// Every value that was published, without `None` and without repetitions.
+    fn values(&self, topic: &str) -> Vec<u64> {
+        let payloads = self.observer.payloads(topic);
+        let numbers = payloads.iter().filter(|payload| *payload != "None");
+        let mut values: Vec<u64> = numbers.map(|payload| payload.parse().expect("a number")).collect();
+        values.dedup();
+        values
+    }
+
+    fn set_relay(&self, wanted: &str) -> Value {
+        let from = self.observer.count();
+        self.observer.publish("busker/one/relay/set", wanted);
+        let outcome = self.observer.wait_for_next("busker/one/relay/outcome", from);
+        serde_json::from_str(&outcome).expect("an outcome is JSON")
+    }
+}
