@@ -224,6 +224,14 @@ mod tests {
         }
     }
 
+    #[test]
+    fn the_example_of_the_profile_language_is_a_good_profile() {
+        let page = fs::read_to_string("device-profiles/README.md").expect("the page");
+        let example = page.split("```yaml\n").nth(1).and_then(|rest| rest.split("```").next());
+        let device = Library::shipped().check("README.md", example.expect("an example").as_bytes());
+        assert_eq!(device.map(|device| device.profile), Ok("acme/ra8".into()));
+    }
+
     fn shown(id: &str, point: &str) -> serde_json::Value {
         let device = json::device(&Library::shipped().load(id).expect("a good profile"));
         let points = device["points"].as_array().expect("points");

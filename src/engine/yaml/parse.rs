@@ -274,12 +274,17 @@ impl Builder<'_> {
             format!("the map{} is not closed; expected `,` or `}}`", self.begun())
         } else if says("quoted scalar") && says("end of stream") {
             "a quote is not closed; expected it before the end of the file".into()
-        } else if says("simple key expect") || says("did not find expected key") {
-            "this line is no `key: value`; expected a key and a colon, indented like its neighbours".into()
+        } else if says("simple key expect") {
+            "the line before this one is no `key: value`; expected a `:` in it".into()
+        } else if says("did not find expected key") {
+            "this line is indented unlike its neighbours; expected the same spaces before each key of a map"
+                .into()
+        } else if says("must be followed by a valid YAML whitespace") {
+            "no space stands before this; expected one behind `:` or `-`, and no tab".into()
         } else if says("invalid indentation") {
             "wrong indentation; expected the line indented further than the key that it belongs to".into()
-        } else if says("unexpected character: `@'") || says("unexpected character: ``'") {
-            "a text cannot begin with this character; put it in quotes".into()
+        } else if let Some(character) = info.strip_prefix("unexpected character: `") {
+            format!("a text cannot begin with `{}`; put it in quotes", character.trim_end_matches('\''))
         } else {
             format!("this is not YAML ({info}); look at the indentation, quotes and brackets here and above")
         };

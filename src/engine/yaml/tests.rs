@@ -207,3 +207,17 @@ fn a_long_line_is_cut_around_the_fault() {
     let caret = lines[3].chars().position(|character| character == '^').expect("a caret");
     assert!(lines[2].chars().skip(caret).collect::<String>().starts_with("400"), "{shown}");
 }
+
+#[test]
+fn places_are_right_whatever_ends_the_lines() {
+    let text = "# Größe\r\nname: ä\r\nmore: {1: 2,\r\n  °: 400}\r\n";
+    let (_, faults) = read_sample(text);
+    let places: Vec<String> = faults.into_sorted().iter().map(|fault| fault.to_string()).collect();
+    assert_eq!(
+        places,
+        [
+            "f:4:3: `°` is not a whole number; expected one like `12` or `0x0C`\n  |\n4 |   °: 400}\n  |   ^\n",
+            "f:4:6: 400 is out of range; expected 0 to 255\n  |\n4 |   °: 400}\n  |      ^^^\n",
+        ]
+    );
+}
