@@ -24,4 +24,4 @@ lint:
 # Rewrites the goldens, the messages of faulty files and the schemas from what the program does now.
 # Read the difference before committing it.
 goldens:
-	BLESS=1 cargo test --locked
+	@$(WITH_MOSQUITTO) && BLESS=1 exec cargo test --locked

@@ -3,6 +3,7 @@
 //! [`file`] is the shape, `words` its scalars; here and in `wishes` are the rules beyond the shape.
 
 pub mod file;
+mod secrets;
 mod wishes;
 mod words;
 
@@ -32,13 +33,19 @@ pub fn load(
     library: &Library,
 ) -> Result<(Settings, Vec<Warning>), Vec<Diagnostic>> {
     let mut faults = Faults::default();
-    let file: Option<Configuration> = Source::from_bytes(file_name, bytes, &mut faults)
-        .and_then(|source| parse(&source, &mut faults))
-        .and_then(|node| read(&node, &mut faults));
+    let source = Source::from_bytes(file_name, bytes, &mut faults);
+    let node = source.as_ref().and_then(|source| parse(source, &mut faults));
+    let file: Option<Configuration> = node.and_then(|node| read(&node, &mut faults));
     let mut resolver = Resolver { library, faults, warnings: Faults::default() };
     let settings = file.and_then(|file| resolver.settings(&file));
-    let warnings = resolver.warnings.into_sorted();
-    resolver.faults.into_result(settings).map(|settings| (settings, warnings))
+    let Resolver { mut faults, mut warnings, .. } = resolver;
+    if let Some(source) = source {
+        // A fault is shown with its line, and that goes to logs.
+        let shown = Source::new(file_name, &secrets::hidden(source.text()));
+        faults.show_by(&shown);
+        warnings.show_by(&shown);
+    }
+    faults.into_result(settings).map(|settings| (settings, warnings.into_sorted()))
 }
 
 /// The folders under `profiles`, which must be read before [`load`]. Faults are left to [`load`].

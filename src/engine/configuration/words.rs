@@ -188,6 +188,10 @@ impl Scalar for BrokerUrl {
     const EXPECTED: &'static str = "a URL like `mqtt://localhost:1883`";
 
     fn parse(text: &str) -> Result<BrokerUrl, String> {
+        // Before anything that would repeat the text: there is a password in it.
+        if text.contains('@') {
+            return Err("a user stands in the URL; use the keys `username` and `password_file`".into());
+        }
         let expected = Self::EXPECTED;
         let address = match text.split_once("://") {
             Some(("mqtt", address)) => address,
@@ -200,10 +204,6 @@ impl Scalar for BrokerUrl {
             None => return Err(format!("`{text}` is no URL; expected {expected}")),
         };
         let address = address.strip_suffix('/').unwrap_or(address);
-        // Never repeated in a message: there is a password in it.
-        if address.contains('@') {
-            return Err("a user stands in the URL; use the keys `username` and `password_file`".into());
-        }
         let ends_in_host = address.ends_with(']') || !address.contains(':');
         let (host, port) = match address.rsplit_once(':') {
             Some((host, port)) if !ends_in_host => (host, parse_port(port)?),
