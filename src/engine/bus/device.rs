@@ -1,5 +1,6 @@
 //! One device on the bus: whether it is there, what is known of it, what to ask it next.
 
+mod patience;
 mod telling;
 
 use crate::engine::command::{Outcome, OutcomeKind, words_of};
@@ -15,11 +16,8 @@ use crate::engine::time::{Duration, Time};
 use crate::engine::value::Missing;
 
 use super::{Context, Severity, unit_of};
+use patience::{FAILURES_UNTIL_OFFLINE, Patience};
 
-/// So many requests in a row without an answer, and a device counts as offline.
-const FAILURES_UNTIL_OFFLINE: u32 = 3;
-/// The longest pause between two attempts to reach a silent device: what its return may take.
-const PAUSE_LONGEST: Duration = Duration::from_secs(12);
 /// A device that is not the one that the profile describes is asked again after this.
 const PAUSE_MISMATCH: Duration = Duration::from_secs(30);
 /// A read that the device answers with an exception is asked again after this.
@@ -35,8 +33,9 @@ pub(super) struct DeviceState {
     /// What the device has refused to give in one answer.
     refused: Vec<crate::engine::address::Span>,
     presence: Presence,
-    /// Requests without an answer since the last answer.
-    failures: u32,
+    patience: Patience,
+    /// How long the request in flight may wait.
+    asked_timeout: Duration,
     /// Nothing is asked before.
     paused_until: Time,
     served_at: Time,
@@ -80,7 +79,8 @@ impl DeviceState {
             polls,
             refused: Vec::new(),
             presence: Presence::Absent { reason: "not yet asked".into() },
-            failures: 0,
+            patience: Patience::default(),
+            asked_timeout: Duration::ZERO,
             paused_until: Time::default(),
             served_at: Time::default(),
             last_answer_end: Time::default(),
@@ -131,7 +131,7 @@ impl DeviceState {
     /// decides the point's meaning is known.
     pub(super) fn can_take(&self, point: PointIndex) -> bool {
         self.presence == Presence::Present
-            && self.failures == 0
+            && self.patience.failures() == 0
             && self.details(point).selectors().iter().all(|selector| self.known()[*selector].is_some())
     }
 
@@ -206,8 +206,11 @@ impl DeviceState {
         now.max(self.last_answer_end + self.settings.device.wire.limits.delay)
     }
 
-    pub(super) fn timeout(&self, of_bus: Duration) -> Duration {
-        self.settings.device.wire.response_timeout.unwrap_or(of_bus).max(of_bus)
+    /// How long the next request may wait for its answer.
+    pub(super) fn timeout(&mut self, of_bus: Duration) -> Duration {
+        let demanded = self.settings.device.wire.response_timeout;
+        self.asked_timeout = self.patience.timeout(demanded.unwrap_or(of_bus).max(of_bus), demanded);
+        self.asked_timeout
     }
 
     pub(super) fn request(&self, call: Call) -> Request {
@@ -235,7 +238,7 @@ impl DeviceState {
 
     /// The link is up: ask at once.
     pub(super) fn reconnect(&mut self, now: Time) {
-        self.failures = 0;
+        self.patience.start_anew();
         self.paused_until = now;
         self.polls.want_all();
     }
@@ -246,7 +249,7 @@ impl DeviceState {
         self.last_answer_end = reply.last_byte_at.unwrap_or(now);
         if matches!(reply.result, Ok(_) | Err(RequestError::Exception(_))) {
             self.last_answer_at = Some(now);
-            self.failures = 0;
+            self.patience.answered(reply.first_byte_at.map(|first| first - reply.sent_at));
         }
     }
 
@@ -312,11 +315,9 @@ impl DeviceState {
     }
 
     fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
-        self.failures += 1;
-        // 0.25 s, 0.5 s, 1 s, … : the others have the bus meanwhile.
-        let pause = Duration::from_millis(125 << self.failures.min(8)).min(PAUSE_LONGEST);
-        self.paused_until = now + pause;
-        if self.failures == FAILURES_UNTIL_OFFLINE {
+        self.patience.unanswered();
+        self.paused_until = now + self.patience.pause(self.asked_timeout);
+        if self.patience.failures() == FAILURES_UNTIL_OFFLINE {
             let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row");
             context.say(Severity::Warning, format!("device {} is offline: {reason}", self.settings.name));
             self.lose(now, &reason, context);
