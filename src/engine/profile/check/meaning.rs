@@ -192,7 +192,7 @@ impl Rules<'_, '_> {
                         .find_map(|form| form.unit_by.as_ref())
                         .or(file.is.as_ref().and(file.by.as_ref()))
                     {
-                        self.check_selector(selector, path, Wanted::Names);
+                        self.check_selector(selector, path, Wanted::Units);
                     }
                 }
             }
@@ -218,6 +218,11 @@ impl Rules<'_, '_> {
                 (Some(form), Wanted::Number) if matches!(form.names, Names::All(_)) => {
                     format!("`{name}` has names and no number of decimals; expected a point with a number")
                 }
+                (Some(form), Wanted::Units) if form.names.list().is_empty() => {
+                    format!(
+                        "`{name}` has no named values; expected the units there, as in `values: {{0: °C, 1: °F}}`"
+                    )
+                }
                 _ => return,
             }
         };
@@ -242,6 +247,7 @@ impl Rules<'_, '_> {
 enum Wanted {
     Names,
     Number,
+    Units,
 }
 
 fn digits_path(form: &Form) -> Option<At<PointPath>> {
