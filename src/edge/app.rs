@@ -26,8 +26,8 @@ use crate::engine::topics::{Message, Topics};
 
 /// How often the gateway looks at itself. What has changed for the worse or the better is told at
 /// once, the rest each minute.
-const LOOK_EVERY: Duration = Duration::from_secs(5);
-const TELL_HEALTH_EVERY: u32 = 12;
+const LOOK_EVERY: Duration = Duration::from_secs(1);
+const TELL_HEALTH_EVERY: Duration = Duration::from_secs(60);
 
 /// How long the buses may take to finish what is in flight.
 const BUSES_END_WITHIN: Duration = Duration::from_secs(10);
@@ -217,15 +217,16 @@ impl Route {
 async fn watch(reporter: Arc<Reporter>, topics: Topics, mailbox: Arc<Mailbox>) {
     let every = shutdown::watchdog_interval().map_or(LOOK_EVERY, |interval| interval.min(LOOK_EVERY));
     let mut ticks = tokio::time::interval(every);
+    let rounds = TELL_HEALTH_EVERY.as_millis() / every.as_millis().max(1);
     let mut told: Option<Vec<bool>> = None;
-    for round in 0u32.. {
+    for round in 0u128.. {
         ticks.tick().await;
         let report = reporter.report().await;
         if report.buses.iter().all(|bus| bus.responding) {
             shutdown::feed_watchdog();
         }
         let states = states(&report);
-        if round % TELL_HEALTH_EVERY == 0 || told.as_ref() != Some(&states) {
+        if round % rounds.max(1) == 0 || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
         }
@@ -236,5 +237,5 @@ async fn watch(reporter: Arc<Reporter>, topics: Topics, mailbox: Arc<Mailbox>) {
 fn states(report: &GatewayReport) -> Vec<bool> {
     let buses = report.buses.iter().flat_map(|bus| [bus.report.up, bus.responding]);
     let devices = report.devices().map(|(_, device)| device.online);
-    buses.chain(devices).collect()
+    buses.chain(devices).chain([report.broker.connected]).collect()
 }

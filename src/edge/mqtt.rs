@@ -216,12 +216,9 @@ fn reconnect_after(attempts: u32, seed: u64) -> Duration {
 /// Without credentials, since the library's errors hold none.
 fn reason(error: &ConnectionError, address: &str) -> String {
     match error {
-        ConnectionError::ConnectionRefused(ConnectReturnCode::BadUserNamePassword) => {
-            format!("the broker at {address} refuses the user name or the password")
-        }
-        ConnectionError::ConnectionRefused(ConnectReturnCode::NotAuthorized) => {
-            format!("the broker at {address} does not authorise this user")
-        }
+        ConnectionError::ConnectionRefused(
+            ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
+        ) => format!("the broker at {address} refuses this user name and password"),
         ConnectionError::ConnectionRefused(code) => format!("the broker at {address} refuses: {code:?}"),
         ConnectionError::Io(error) => format!("no connection to the broker at {address}: {error}"),
         error => format!("the connection to the broker at {address} is lost: {error}"),
