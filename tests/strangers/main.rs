@@ -4,5 +4,7 @@
 //! pymodbus comes from the Python package index and mbpoll (with libmodbus) from Debian, each once,
 //! into `.peers/`. Where one cannot be had, its test says so and passes, unless `CI=true` is set.
 
+mod broker;
+mod gateway;
 mod peers;
 mod simulator;
