@@ -6,6 +6,7 @@ use crate::engine::time::{Duration, Time};
 use crate::simulator::fuehlersysteme::relay8::Relay8;
 use crate::simulator::metz_connect::MetzConnect;
 use crate::simulator::metz_connect::mr_ai8::MrAi8;
+use crate::simulator::metz_connect::mr_di::{MrDi4, MrDi10};
 use crate::simulator::metz_connect::mr_do4::MrDo4;
 use crate::simulator::metz_connect::mr_si4::MrSi4;
 
@@ -153,11 +154,14 @@ pub enum Model {
     MrDo4,
     MrSi4,
     MrAi8,
+    MrDi4,
+    MrDi10,
     Relay8,
 }
 
 impl Model {
-    pub const ALL: [Model; 4] = [Model::MrDo4, Model::MrSi4, Model::MrAi8, Model::Relay8];
+    pub const ALL: [Model; 6] =
+        [Model::MrDo4, Model::MrSi4, Model::MrAi8, Model::MrDi4, Model::MrDi10, Model::Relay8];
 
     /// The identifier of the device's profile.
     pub const fn id(self) -> &'static str {
@@ -165,6 +169,8 @@ impl Model {
             Model::MrDo4 => "metz-connect/mr-do4",
             Model::MrSi4 => "metz-connect/mr-si4",
             Model::MrAi8 => "metz-connect/mr-ai8",
+            Model::MrDi4 => "metz-connect/mr-di4",
+            Model::MrDi10 => "metz-connect/mr-di10",
             Model::Relay8 => "fuehlersysteme/relay8",
         }
     }
@@ -179,6 +185,8 @@ impl Model {
             Model::MrDo4 => Box::new(MetzConnect::new(now, line, MrDo4::new(now))),
             Model::MrSi4 => Box::new(MetzConnect::new(now, line, MrSi4::new(now))),
             Model::MrAi8 => Box::new(MetzConnect::new(now, line, MrAi8::new(now))),
+            Model::MrDi4 => Box::new(MetzConnect::new(now, line, MrDi4::new(now))),
+            Model::MrDi10 => Box::new(MetzConnect::new(now, line, MrDi10::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
         }
     }

@@ -32,7 +32,7 @@ pub struct Step {
 pub const COMMANDS: &str = "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4)
   unit N input I ohms X | volts X | celsius X | open
                                             what is connected to an input (MR-AI8)
-  unit N input I contact closed|open        a contact (MR-SI4)
+  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
   unit N button                             somebody presses the button (MR-SI4)

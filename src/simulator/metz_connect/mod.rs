@@ -5,6 +5,7 @@
 
 mod channel;
 pub mod mr_ai8;
+pub mod mr_di;
 pub mod mr_do4;
 pub mod mr_si4;
 mod sensors;
@@ -252,13 +253,20 @@ mod tests {
 
     #[test]
     fn identification_gives_vendor_product_and_version_in_one_reply() {
-        for (model, product) in [(Model::MrDo4, "MR-DO4 V1.4"), (Model::MrSi4, "MR-SI4 V2.1")] {
+        for (model, product) in [
+            (Model::MrDo4, "MR-DO4 V1.4"),
+            (Model::MrSi4, "MR-SI4 V2.1"),
+            (Model::MrAi8, "MR-AI8 V1.8"),
+            (Model::MrDi4, "MR-DI4 V1.4"),
+            (Model::MrDi10, "MR-DI10 V1.4"),
+        ] {
             let (name, version) = product.split_once(' ').expect("a name and a version");
             let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();
             let mut bench = Bench::new(model);
             let reply = format!(
-                "2B0E01010000030011{}0106{}0204{}",
+                "2B0E01010000030011{}01{:02X}{}0204{}",
                 hex("METZ CONNECT GmbH"),
+                name.len(),
                 hex(name),
                 hex(version)
             );
