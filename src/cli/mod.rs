@@ -15,6 +15,7 @@ mod by_hand;
 mod check;
 pub mod configuration;
 mod demo;
+mod diagnose;
 pub mod log;
 pub mod output;
 mod plan;
@@ -45,6 +46,7 @@ macro_rules! verbs {
 
 verbs! {
     check Check,
+    diagnose Diagnose,
     demo Demo,
     plan Plan,
     profiles Profiles,

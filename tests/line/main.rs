@@ -295,6 +295,34 @@ fn a_broadcast_is_sent_and_nobody_is_waited_for() {
     assert!(String::from_utf8_lossy(&read.stdout).contains("4711"), "{read:?}");
 }
 
+#[test]
+fn what_a_device_says_of_itself_arrives_whole_in_any_pieces() {
+    let splits: [Misbehave; 3] = [
+        |_, good| vec![Step::Say(good)],
+        |_, good| {
+            let middle = good.len() / 2;
+            vec![Step::Say(good[..middle].to_vec()), Step::Pause(10), Step::Say(good[middle..].to_vec())]
+        },
+        |_, good| in_single_bytes(good),
+    ];
+    for split in splits {
+        let peer = Peer::on_a_pseudo_terminal();
+        peer.misbehave(split);
+        let path = peer.path().display().to_string();
+        let line = ["--serial", &path, "--baud", "115200", "--parity", "none"];
+        let output = by_hand("diagnose", &line, &["--unit", "1", "--json"]);
+        assert!(output.status.success(), "{output:?}");
+        let found: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        for (name, value) in
+            [("vendor", "ACME"), ("product", "RA1"), ("revision", "1.23"), ("server_id", "42 31 FF")]
+        {
+            assert_eq!(found[name], value, "{name}");
+        }
+        assert_eq!(found["query_returned"], true);
+        assert_eq!(found["bus_messages"], 0);
+    }
+}
+
 fn by_hand(verb: &str, line: &[&str], rest: &[&str]) -> Output {
     Command::new(program()).arg(verb).args(line).args(rest).output().expect("the program is built")
 }

@@ -1,0 +1,127 @@
+//! `busker diagnose`: what a device says of itself and of its line.
+
+use serde_json::{Map, Value, json};
+
+use super::by_hand::{Asked, ByHand};
+use super::{Failure, output};
+use crate::engine::modbus::{Answer, Call, RequestError};
+
+/// Ask a device who it is and how it hears the line
+///
+/// Asks for its identification (function 43/14) and server id (17), returns a query (8/0), and reads
+/// its counters (8/11 to 8/18). What a device refuses is shown as that: few know all of it.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:
+  busker diagnose --serial /dev/ttyUSB0 --baud 19200 --parity even --unit 18")]
+pub struct Args {
+    #[command(flatten)]
+    device: ByHand,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The counters of function 8, by sub-function (Modbus application protocol V1.1b3, 6.8.1).
+const COUNTERS: [(u16, &str); 8] = [
+    (11, "bus_messages"),
+    (12, "bus_checksum_errors"),
+    (13, "bus_exceptions"),
+    (14, "unit_messages"),
+    (15, "unit_no_responses"),
+    (16, "unit_negative_acknowledges"),
+    (17, "unit_busy"),
+    (18, "bus_overruns"),
+];
+
+/// What the query holds that must come back.
+const QUERY: u16 = 0xA537;
+
+/// A line of the result: what was asked, and the device's word or why there is none.
+type Finding = (String, Result<Value, RequestError>);
+
+pub fn run(args: Args) -> Result<(), Failure> {
+    let mut device = args.device.open()?;
+    let mut findings = identification(&mut device)?;
+    let server_id = device.ask(&Call::ReportServerId)?;
+    findings.push(("server_id".into(), server_id.map(|answer| told(&answer))));
+    let query = Call::Diagnostics { function: 0, data: vec![QUERY] };
+    findings.push(("query_returned".into(), device.ask(&query)?.map(|_| Value::Bool(true))));
+    for (function, name) in COUNTERS {
+        let answer = device.ask(&Call::Diagnostics { function, data: vec![0] })?;
+        findings.push((name.into(), answer.map(|answer| told(&answer))));
+    }
+    print(&findings, args.json)?;
+    // A refusal is an answer, silence is not.
+    let heard = |(_, result): &Finding| matches!(result, Ok(_) | Err(RequestError::Exception(_)));
+    match findings.iter().any(heard) {
+        true => Ok(()),
+        false => Err(anyhow::anyhow!("unit {} answers nothing that fits", device.unit()).into()),
+    }
+}
+
+/// The objects of function 43/14, asked on while more follow.
+fn identification(device: &mut Asked) -> Result<Vec<Finding>, Failure> {
+    let mut findings = Vec::new();
+    let mut object = 0;
+    loop {
+        match device.ask(&Call::ReadIdentification { code: 1, object })? {
+            Ok(Answer::Identification(answer)) => {
+                let objects = answer.objects.into_iter();
+                findings.extend(objects.map(|(number, text)| (object_name(number), Ok(Value::String(text)))));
+                match answer.next {
+                    // Only upwards: a device that begins again would be asked for ever.
+                    Some(next) if next > object => object = next,
+                    _ => return Ok(findings),
+                }
+            }
+            Ok(_) => return Ok(findings),
+            Err(error) => {
+                findings.push(("identification".into(), Err(error)));
+                return Ok(findings);
+            }
+        }
+    }
+}
+
+fn object_name(number: u8) -> String {
+    match number {
+        0 => "vendor".into(),
+        1 => "product".into(),
+        2 => "revision".into(),
+        number => format!("object_{number}"),
+    }
+}
+
+fn told(answer: &Answer) -> Value {
+    match answer {
+        Answer::Diagnostics(words) => words.first().copied().into(),
+        Answer::ServerId(bytes) => {
+            bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(" ").into()
+        }
+        _ => Value::Null,
+    }
+}
+
+fn print(findings: &[Finding], as_json: bool) -> Result<(), Failure> {
+    if as_json {
+        let entry = |(name, result): &Finding| {
+            let value = match result {
+                Ok(value) => value.clone(),
+                Err(error) => json!({"error": error.to_string()}),
+            };
+            (name.clone(), value)
+        };
+        return output::print_json(&findings.iter().map(entry).collect::<Map<_, _>>());
+    }
+    let mut table = output::Table::new();
+    for (name, result) in findings {
+        let text = match result {
+            Ok(Value::String(text)) => text.clone(),
+            Ok(Value::Bool(_)) => "yes".into(),
+            Ok(value) => value.to_string(),
+            Err(error) => format!("({error})"),
+        };
+        table.row([name.replace('_', " "), text]);
+    }
+    output::print(&table.render())
+}
