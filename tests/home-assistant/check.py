@@ -84,7 +84,13 @@ def main() -> None:
         gateway = start(ending, BUSKER, "run", "--config", str(configuration))
         home = Home(folder / "home-assistant", broker.port, ending)
         print(f"Home Assistant {home.version}", flush=True)
-        check_all(home, broker, gateway, Plant(simulator, modbus_port))
+        try:
+            check_all(home, broker, gateway, Plant(simulator, modbus_port))
+        except Fault:
+            # What the gateway itself says about it, for whoever has to find out.
+            for topic in ("busker/bridge/health", "busker/+/info"):
+                print(json.dumps(broker.retained(topic), indent=1), file=sys.stderr)
+            raise
     print("all as it should be")
 
 
