@@ -1,6 +1,7 @@
 //! `make demo` as a newcomer does it: start it, read what it prints, do what it says, interrupt it.
 
-use std::io::{BufRead, BufReader};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
@@ -9,6 +10,8 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{Winsize, tcsetwinsize};
 
 /// Far longer than anything here takes; only a failing test waits for it.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -62,6 +65,43 @@ fn make_demo_shows_live_values_and_its_three_commands_do_what_they_say() {
     assert!(TcpStream::connect(introduction.broker).is_err(), "the broker is still there");
     let left: Vec<_> = temporary.path().read_dir().expect("a folder").collect();
     assert!(left.is_empty(), "{left:?}");
+}
+
+#[test]
+fn on_a_terminal_it_is_a_table_that_is_redrawn_in_place() {
+    let controller = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
+    grantpt(&controller).and_then(|()| unlockpt(&controller)).expect("it can be used");
+    let path = ptsname(&controller, Vec::new()).expect("its name").into_string().expect("in UTF-8");
+    let terminal = File::options().read(true).write(true).open(path).expect("it opens");
+    let size = Winsize { ws_row: 40, ws_col: 100, ws_xpixel: 0, ws_ypixel: 0 };
+    tcsetwinsize(&terminal, size).expect("a size");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_busker"))
+        .arg("demo")
+        .stdin(Stdio::null())
+        .stdout(terminal)
+        .spawn()
+        .expect("the program starts");
+
+    // What it writes, frame by frame: each begins at the upper left corner.
+    let mut controller = File::from(controller);
+    let (mut text, mut buffer, mut is_stopping) = (String::new(), [0; 4096], false);
+    // Reading fails when the last writer has gone.
+    while let Ok(count @ 1..) = controller.read(&mut buffer) {
+        text.push_str(&String::from_utf8_lossy(&buffer[..count]));
+        // The reading of a meter that counts: the table lives.
+        let counts = |frame: &&str| frame.contains("meter_1_reading ") && frame.contains("relay_1 OFF");
+        if !is_stopping && text.split("\x1b[H").filter(counts).count() >= 3 {
+            kill_process(Pid::from_child(&child), Signal::TERM).expect("it can be signalled");
+            is_stopping = true;
+        }
+    }
+    assert_eq!(child.wait().expect("it ends").code(), Some(0));
+    assert!(text.starts_with("\x1b[2J\x1b[?25l"), "it begins on an empty screen, without a cursor");
+    assert!(text.ends_with("\x1b[?25h\r\n"), "it gives the cursor back");
+    assert!(
+        text.split("\x1b[H").skip(1).all(|frame| frame.starts_with("busker demo: 4 simulated")),
+        "{text}"
+    );
 }
 
 #[test]

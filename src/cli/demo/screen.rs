@@ -12,8 +12,8 @@ use crate::engine::settings::Settings;
 
 use super::broker::{self, Mosquitto};
 
-/// Values beside each other in the table.
-const COLUMNS: usize = 4;
+/// Values beside each other in the table, where there is room.
+const COLUMNS_MAX: usize = 8;
 
 /// Standard output, and what stands on it.
 pub struct Screen {
@@ -86,8 +86,8 @@ impl Screen {
     }
 
     fn draw(&mut self, report: &GatewayReport) -> io::Result<()> {
-        let body: String = report.devices().map(|(_, device)| self.block(device)).collect();
         let (rows, columns) = size();
+        let body: String = report.devices().map(|(_, device)| self.block(device, columns)).collect();
         let mut frame = String::from("\x1b[H");
         // The terminal breaks the long lines of the header by itself: a command is never cut.
         let mut used = 0;
@@ -96,9 +96,19 @@ impl Screen {
             used += line.chars().count().div_ceil(columns).max(1);
         }
         // What does not fit would scroll, and the next frame would stand below it.
-        let room = rows.saturating_sub(used);
-        for (index, line) in body.lines().take(room).enumerate() {
-            let cut: String = line.chars().take(columns).collect();
+        let room = rows.saturating_sub(used).max(1);
+        let mut lines: Vec<String> = body.lines().map(str::to_string).collect();
+        if lines.len() > room {
+            lines.retain(|line| !line.is_empty());
+        }
+        if lines.len() > room {
+            let more = lines.len() - (room - 1);
+            lines.truncate(room - 1);
+            lines.push(format!("… {more} more lines in a higher window"));
+        }
+        for (index, line) in lines.iter().enumerate() {
+            // The last column stays free: a full line is broken by some terminals and not by others.
+            let cut: String = line.chars().take(columns - 1).collect();
             let line_break = if index == 0 { "" } else { "\r\n" };
             frame.push_str(&format!("{line_break}{cut}\x1b[K"));
         }
@@ -111,20 +121,16 @@ impl Screen {
         Ok(())
     }
 
-    fn block(&self, device: &DeviceReport) -> String {
+    fn block(&self, device: &DeviceReport, width: usize) -> String {
         let state = match (device.online, &device.identity, &device.reason) {
             (true, Some(identity), _) => format!("online, {identity}"),
             (true, None, _) => "online".into(),
             (false, _, Some(reason)) => format!("offline: {reason}"),
             (false, _, None) => "offline".into(),
         };
-        let mut table = Table::new();
         let values: Vec<String> =
             self.values(device).map(|(name, value)| format!("{name} {value}")).collect();
-        for row in values.chunks(COLUMNS) {
-            table.row(std::iter::once(" ").chain(row.iter().map(String::as_str)));
-        }
-        format!("\n{}: {state}\n{}", device.name, table.render())
+        format!("\n{}: {state}\n{}", device.name, side_by_side(&values, width))
     }
 
     /// A line for each value that has changed.
@@ -160,6 +166,19 @@ impl Screen {
     }
 }
 
+/// As many values in a line as fit, in columns.
+fn side_by_side(values: &[String], width: usize) -> String {
+    let arranged = |columns: usize| {
+        let mut table = Table::new();
+        for row in values.chunks(columns) {
+            table.row(std::iter::once(" ").chain(row.iter().map(String::as_str)));
+        }
+        table.render()
+    };
+    let fits = |text: &String| text.lines().all(|line| line.chars().count() < width);
+    (2..=COLUMNS_MAX).rev().map(arranged).find(fits).unwrap_or_else(|| arranged(1))
+}
+
 /// Whether a person in front of the device would look at it: no setting, no diagnosis.
 fn is_worth_a_look(point: &Point) -> bool {
     let look = &point.presentation;
@@ -182,7 +201,7 @@ fn shown_program(program: &str) -> String {
 /// Rows and columns of the terminal.
 fn size() -> (usize, usize) {
     match rustix::termios::tcgetwinsize(io::stdout()) {
-        Ok(size) if size.ws_row > 0 && size.ws_col > 0 => (size.ws_row.into(), size.ws_col.into()),
+        Ok(size) if size.ws_row > 1 && size.ws_col > 1 => (size.ws_row.into(), size.ws_col.into()),
         _ => (24, 80),
     }
 }
@@ -191,4 +210,17 @@ fn write(text: &str) -> io::Result<()> {
     let mut stdout = io::stdout().lock();
     stdout.write_all(text.as_bytes())?;
     stdout.flush()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_stand_side_by_side_as_far_as_there_is_room() {
+        let values = ["relay_1 ON", "relay_2 OFF", "relay_3 ON"].map(str::to_string);
+        assert_eq!(side_by_side(&values, 80), "   relay_1 ON  relay_2 OFF  relay_3 ON\n");
+        assert_eq!(side_by_side(&values, 30), "   relay_1 ON  relay_2 OFF\n   relay_3 ON\n");
+        assert_eq!(side_by_side(&values, 5), "   relay_1 ON\n   relay_2 OFF\n   relay_3 ON\n");
+    }
 }
