@@ -8,6 +8,7 @@ mod check;
 mod expand;
 pub mod file;
 mod library;
+mod lookup;
 mod resolve;
 mod shared;
 mod text;

@@ -8,7 +8,7 @@ use crate::engine::device::{
     Quirks, Unit, Write, WriteRule,
 };
 use crate::engine::profile::expand::Expanded;
-use crate::engine::profile::file::{self, Cases, Form, Profile, Values};
+use crate::engine::profile::file::{Cases, Form, Profile, Values};
 use crate::engine::profile::shared::Shared;
 use crate::engine::profile::text::{Digits, PointPath, Quirk, Writable};
 use crate::engine::value::Decimal;
@@ -37,11 +37,11 @@ pub fn device(profile: &Profile, points: &[Expanded<'_>], shared: &Shared, fault
     }
 }
 
-struct Resolution<'a, 'f> {
-    profile: &'f Profile,
-    points: &'a [Expanded<'f>],
+pub struct Resolution<'a, 'f> {
+    pub profile: &'f Profile,
+    pub points: &'a [Expanded<'f>],
     shared: &'a Shared,
-    faults: &'a mut Faults,
+    pub faults: &'a mut Faults,
 }
 
 impl Resolution<'_, '_> {
@@ -52,7 +52,7 @@ impl Resolution<'_, '_> {
             (Some(by), Some(cases)) if !expanded.is_flag => self.cases(expanded, by, cases),
             _ => Encoding::Plain(self.form(expanded, &file.form)),
         };
-        let re_read = file.re_read.iter().flat_map(|path| self.lookup_all(path, expanded)).collect();
+        let re_read = file.re_read.iter().flat_map(|path| self.lookup_all(path, Some(expanded))).collect();
         Point {
             name: expanded.name.clone(),
             at: expanded.at,
@@ -81,12 +81,12 @@ impl Resolution<'_, '_> {
             Some(At { value: Digits::Fixed(decimals), .. }) => Some(Decimals::Fixed(*decimals)),
             Some(At { value: Digits::By(path), place }) => {
                 let path = At { value: path.clone(), place: place.clone() };
-                self.lookup(&path, expanded).map(Decimals::By)
+                self.lookup(&path, Some(expanded)).map(Decimals::By)
             }
         };
         resolved.unit = match (&form.unit, &form.unit_by) {
             (Some(unit), _) => Unit::Fixed(unit.value.clone()),
-            (None, Some(path)) => self.lookup(path, expanded).map_or(Unit::None, Unit::By),
+            (None, Some(path)) => self.lookup(path, Some(expanded)).map_or(Unit::None, Unit::By),
             (None, None) => Unit::None,
         };
         resolved.difference = expanded.file.difference;
@@ -128,7 +128,7 @@ impl Resolution<'_, '_> {
     fn cases(&mut self, expanded: &Expanded<'_>, by: &At<PointPath>, cases: &At<Cases>) -> Encoding {
         // A float can be anything, so that no check finds fault with what is only unknown.
         let unknown = Encoding::Plain(device::Form::new(Kind::F32));
-        let Some(by_index) = self.lookup(by, expanded) else { return unknown };
+        let Some(by_index) = self.lookup(by, Some(expanded)) else { return unknown };
         let selector = &self.points[by_index];
         let mut names = self.names(selector, &selector.file.form);
         if names.is_empty() && kind_of(selector, &selector.file.form, &names) == Kind::Bool {
@@ -188,74 +188,14 @@ impl Resolution<'_, '_> {
             }
         }
         if !missing.is_empty() {
-            let (has, cases_word) = if missing.len() == 1 { ("has", "case") } else { ("have", "case") };
-            self.faults.add(&cases.place, format!(
-                "{} of `{}` {has} no {cases_word} here; expected one for each value, `null` where there is no reading",
-                listed(&missing), by.value.0
-            ));
-        }
-        Encoding::Cases { by: by_index, cases: resolved }
-    }
-
-    /// The one point that `path` names, as seen from `from`.
-    fn lookup(&mut self, path: &At<PointPath>, from: &Expanded<'_>) -> Option<PointIndex> {
-        let found = self.lookup_all(path, from);
-        if found.len() > 1 {
-            let first = &self.points[found[0]].name;
-            self.faults.add(&path.place, format!(
-                "`{}` are {} points (`{first}` and others); expected one that is there once, or one of the same repetition",
-                path.value.0, found.len()
-            ));
-            return None;
-        }
-        found.first().copied()
-    }
-
-    /// All points that `path` names: those of the same repetition, or else those at the top.
-    fn lookup_all(&mut self, path: &At<PointPath>, from: &Expanded<'_>) -> Vec<PointIndex> {
-        let with_path = |wanted: &str, repetition: Option<u16>| -> Vec<PointIndex> {
-            let fits = |point: &Expanded<'_>| {
-                point.path == wanted && (repetition.is_none() || point.repetition == repetition)
-            };
-            (0..self.points.len()).filter(|index| fits(&self.points[*index])).collect()
-        };
-        let beside = match &from.group {
-            Some(group) => with_path(&format!("{group}.{}", path.value.0), from.repetition),
-            None => Vec::new(),
-        };
-        let found = if beside.is_empty() { with_path(&path.value.0, None) } else { beside };
-        if found.is_empty() && !self.has_faults(&path.value.0) {
-            let prefix = from.group.as_ref().map(|group| format!("{group}."));
-            let mut known: Vec<&str> = Vec::new();
-            for point in self.points {
-                let local = prefix.as_ref().and_then(|prefix| point.path.strip_prefix(prefix.as_str()));
-                let name = local.unwrap_or(&point.path);
-                if !known.contains(&name) {
-                    known.push(name);
-                }
-            }
+            let have = if missing.len() == 1 { "has" } else { "have" };
+            let (missing, by) = (listed(&missing), &by.value.0);
             self.faults.add(
-                &path.place,
-                format!("no point is called `{}`; {}", path.value.0, list_of_choices(&path.value.0, &known)),
+                &cases.place,
+                format!("{missing} of `{by}` {have} no case here; expected one for each value, `null` where there is no reading"),
             );
         }
-        found
-    }
-
-    /// Whether `path` may name a point that could not be read.
-    fn has_faults(&self, path: &str) -> bool {
-        let last = path.rsplit('.').next().unwrap_or(path);
-        let unread = |points: &crate::engine::yaml::Map<_, file::Point>| {
-            points.unread.iter().any(|name: &At<crate::engine::profile::text::Name>| {
-                name.value.0 == last || path.starts_with(&name.value.0)
-            })
-        };
-        unread(&self.profile.points)
-            || self
-                .profile
-                .points
-                .iter()
-                .any(|(_, point)| point.points.as_ref().is_some_and(|points| unread(points)))
+        Encoding::Cases { by: by_index, cases: resolved }
     }
 
     fn order(&self) -> Order {
@@ -301,27 +241,8 @@ impl Resolution<'_, '_> {
             clamps_with_exception: wire.quirks.contains(&Quirk::ClampsWithException),
             exception_function_varies: wire.quirks.contains(&Quirk::ExceptionFunctionVaries),
         };
-        resolved.watchdog = wire.watchdog.as_ref().and_then(|path| self.lookup_at_top(path));
+        resolved.watchdog = wire.watchdog.as_ref().and_then(|path| self.lookup(path, None));
         resolved
-    }
-
-    fn lookup_at_top(&mut self, path: &At<PointPath>) -> Option<PointIndex> {
-        let found: Vec<PointIndex> =
-            (0..self.points.len()).filter(|index| self.points[*index].path == path.value.0).collect();
-        if found.len() != 1 && !self.has_faults(&path.value.0) {
-            let mut known: Vec<&str> = self.points.iter().map(|point| point.path.as_str()).collect();
-            known.dedup();
-            let message = match found.len() {
-                0 => format!(
-                    "no point is called `{}`; {}",
-                    path.value.0,
-                    list_of_choices(&path.value.0, &known)
-                ),
-                count => format!("`{}` are {count} points; expected one that is there once", path.value.0),
-            };
-            self.faults.add(&path.place, message);
-        }
-        found.first().copied()
     }
 
     fn identify(&mut self) -> Option<device::Identify> {
@@ -354,21 +275,7 @@ impl Resolution<'_, '_> {
 
     fn presentations(&mut self, resolved: &mut [Point]) {
         for (path, wish) in self.profile.home_assistant.iter() {
-            let found: Vec<PointIndex> =
-                (0..self.points.len()).filter(|index| self.points[*index].path == path.value.0).collect();
-            if found.is_empty() && !self.has_faults(&path.value.0) {
-                let mut known: Vec<&str> = self.points.iter().map(|point| point.path.as_str()).collect();
-                known.dedup();
-                self.faults.add(
-                    &path.place,
-                    format!(
-                        "no point has the path `{}`; {}",
-                        path.value.0,
-                        list_of_choices(&path.value.0, &known)
-                    ),
-                );
-            }
-            for index in found {
+            for index in self.lookup_all(path, None) {
                 let text = |text: &Option<At<String>>| text.as_ref().map(|text| text.value.clone());
                 resolved[index].presentation = Presentation {
                     platform: wish.r#as.as_ref().map(|platform| platform.value),
