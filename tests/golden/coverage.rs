@@ -22,6 +22,11 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 65, 66, ALL),
         ],
     ),
+    // Page 14.
+    (
+        "metz-connect/mr-di4",
+        &[(Table::Discrete, 0, 3, ALL), (Table::Input, 0, 0, 0x000F), (Table::Holding, 65, 65, ALL)],
+    ),
     // Pages 16 and 17.
     (
         "metz-connect/mr-si4",
