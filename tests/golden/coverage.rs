@@ -27,6 +27,11 @@ const MANUALS: &[(&str, &[Registers])] = &[
         "metz-connect/mr-di4",
         &[(Table::Discrete, 0, 3, ALL), (Table::Input, 0, 0, 0x000F), (Table::Holding, 65, 65, ALL)],
     ),
+    // Page 15.
+    (
+        "metz-connect/mr-di10",
+        &[(Table::Discrete, 0, 9, ALL), (Table::Input, 0, 0, 0x03FF), (Table::Holding, 65, 65, ALL)],
+    ),
     // Pages 16 and 17.
     (
         "metz-connect/mr-si4",
