@@ -22,6 +22,16 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 65, 66, ALL),
         ],
     ),
+    // Pages 6 to 8, as the MR-DO4, with coils 4 to 7 always 0.
+    (
+        "metz-connect/mr-doa4",
+        &[
+            (Table::Coil, 0, 7, ALL),
+            (Table::Holding, 0, 0, 0x00FF),
+            (Table::Holding, 1, 1, 0x000F),
+            (Table::Holding, 65, 66, ALL),
+        ],
+    ),
     // Page 14.
     (
         "metz-connect/mr-di4",
