@@ -56,6 +56,8 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 65, 65, ALL),
         ],
     ),
+    // Page 44.
+    ("metz-connect/mr-ao4", &[(Table::Holding, 0, 7, ALL), (Table::Holding, 65, 66, ALL)]),
     // 65 on page 3, the rest on pages 48 to 57.
     (
         "metz-connect/mr-ai8",
