@@ -58,6 +58,17 @@ const MANUALS: &[(&str, &[Registers])] = &[
     ),
     // Page 44.
     ("metz-connect/mr-ao4", &[(Table::Holding, 0, 7, ALL), (Table::Holding, 65, 66, ALL)]),
+    // Page 46.
+    (
+        "metz-connect/mr-aop4",
+        &[
+            (Table::Coil, 0, 3, ALL),
+            (Table::Discrete, 0, 3, ALL),
+            (Table::Input, 0, 3, ALL),
+            (Table::Holding, 0, 7, ALL),
+            (Table::Holding, 65, 66, ALL),
+        ],
+    ),
     // 65 on page 3, the rest on pages 48 to 57.
     (
         "metz-connect/mr-ai8",
