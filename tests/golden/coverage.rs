@@ -85,6 +85,11 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 70, 101, ALL),
         ],
     ),
+    // Page 59.
+    (
+        "metz-connect/mr-ci4",
+        &[(Table::Input, 0, 3, ALL), (Table::Input, 4, 4, 0x0FFF), (Table::Holding, 65, 65, ALL)],
+    ),
     // FuehlerSysteme, chapters 6.1.1, 6.1.2 and 7: Rreg are input, RWreg and Wreg holding registers.
     (
         "fuehlersysteme/relay8",
