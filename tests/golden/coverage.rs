@@ -32,6 +32,17 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 65, 66, ALL),
         ],
     ),
+    // Pages 10 to 13.
+    (
+        "metz-connect/mr-to4",
+        &[
+            (Table::Coil, 0, 7, ALL),
+            (Table::Holding, 0, 0, 0x00FF),
+            (Table::Holding, 1, 1, 0x000F),
+            (Table::Holding, 2, 17, ALL),
+            (Table::Holding, 65, 66, ALL),
+        ],
+    ),
     // Page 14.
     (
         "metz-connect/mr-di4",
