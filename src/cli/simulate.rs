@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Context;
-use tokio::signal::unix::{SignalKind, signal};
 
 use super::{Failure, output};
+use crate::edge::shutdown::Signals;
 use crate::engine::time::Duration;
 use crate::simulator::script::{parse_duration, parse_script};
 use crate::simulator::{DeviceAt, Fault, Framing, LineSettings, Options, Parity, Simulation, Told};
@@ -79,7 +79,10 @@ pub fn run(args: Args) -> Result<(), Failure> {
         Some(path) => {
             let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
             parse_script(&text).map_err(|errors| {
-                Failure::Faults(errors.iter().map(|error| format!("{}: {error}", path.display())).collect())
+                let place = path.display();
+                Failure::Faults(
+                    errors.iter().map(|(line, error)| format!("{place}:{line}: {error}")).collect(),
+                )
             })?
         }
         None => Vec::new(),
@@ -91,6 +94,9 @@ pub fn run(args: Args) -> Result<(), Failure> {
         state_dir: args.state_dir,
         faults: args.fault,
     };
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    // Before the first door is open: whoever has read its address may end this at once.
+    let mut signals = runtime.block_on(async { Signals::listen() })?;
     let simulation = Simulation::new(&args.devices, options).map_err(Failure::wrong_input)?;
     simulation.listen(tell);
     let mut doors: Vec<Box<dyn std::any::Any>> = Vec::new();
@@ -109,7 +115,8 @@ pub fn run(args: Args) -> Result<(), Failure> {
     simulation.run_script(steps).map_err(Failure::wrong_input)?;
     let simulation = Arc::new(simulation);
     obey_standard_input(&simulation)?;
-    wait_for_the_end()
+    runtime.block_on(signals.wait());
+    Ok(())
 }
 
 fn tell(told: &Told) {
@@ -132,18 +139,4 @@ fn obey_standard_input(simulation: &Arc<Simulation>) -> anyhow::Result<()> {
         }
     })?;
     Ok(())
-}
-
-/// Waits for an interrupt or a request to terminate.
-fn wait_for_the_end() -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    runtime.block_on(async {
-        let (mut interrupt, mut terminate) =
-            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
-        Ok(())
-    })
 }

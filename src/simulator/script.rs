@@ -42,13 +42,13 @@ pub const COMMANDS: &str = "  unit N relay R hand on|off|automatic      a relay'
   at TIME COMMAND                           later: `at 5s unit 19 input 1 ohms 107.8`
 ";
 
-/// Reads a whole script; errors begin with the line's number, and all come at once.
-pub fn parse_script(text: &str) -> Result<Vec<Step>, Vec<String>> {
+/// Reads a whole script, or tells all its errors, each with its line's number from 1.
+pub fn parse_script(text: &str) -> Result<Vec<Step>, Vec<(usize, String)>> {
     let (mut steps, mut errors) = (Vec::new(), Vec::new());
     for (number, line) in text.lines().enumerate() {
         match parse_line(line) {
             Ok(step) => steps.extend(step),
-            Err(error) => errors.push(format!("line {}: {error}", number + 1)),
+            Err(error) => errors.push((number + 1, error)),
         }
     }
     // Steps of the same time stay in the order of their lines.
@@ -201,11 +201,11 @@ mod tests {
     fn all_wrong_lines_of_a_script_are_told_at_once_with_their_numbers() {
         let told =
             parse_script("unit 18 restart\nfoo\nat soon unit 18 restart\nunit 0 button\n").unwrap_err();
-        let beginnings =
-            ["line 2: `foo` is not a command", "line 3: `soon` is not a duration", "line 4: `0`"];
-        assert_eq!(told.len(), beginnings.len(), "{told:?}");
-        for (told, beginning) in told.iter().zip(beginnings) {
-            assert!(told.starts_with(beginning), "{told}");
+        let wanted =
+            [(2, "`foo` is not a command"), (3, "`soon` is not a duration"), (4, "`0` is not a unit")];
+        assert_eq!(told.len(), wanted.len(), "{told:?}");
+        for ((line, error), (wanted_line, beginning)) in told.iter().zip(wanted) {
+            assert!(*line == wanted_line && error.starts_with(beginning), "{line}: {error}");
         }
     }
 
