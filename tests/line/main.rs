@@ -1,15 +1,14 @@
 //! The whole program on lines that misbehave: whatever comes, nothing false is published, each
 //! fault is counted as what it was, and the next reading is right.
 
+mod by_hand;
 mod peer;
 #[path = "../support/mod.rs"]
 mod support;
 
-use std::process::{Command, Output};
-
 use peer::{Asked, Framing, Misbehave, Peer, Step, read_pdu, reply, rtu};
 use serde_json::Value;
-use support::{Busker, Mosquitto, Observer, program, wait_for};
+use support::{Busker, Mosquitto, Observer, wait_for};
 
 /// What no device ever holds.
 const LIE: u16 = 9999;
@@ -276,55 +275,6 @@ fn an_adapter_may_be_unplugged_and_plugged_in_again() {
         gateway.observer.wait_for("busker/one/a", &truth.to_string());
     }
     assert_eq!(gateway.values("busker/one/a"), [100, 101, 102]);
-}
-
-#[test]
-fn a_broadcast_is_sent_and_nobody_is_waited_for() {
-    let peer = Peer::on_a_pseudo_terminal();
-    let path = peer.path().display().to_string();
-    let line = ["--serial", &path, "--baud", "115200", "--parity", "none"];
-    let output = by_hand("write", &line, &["--unit", "0", "holding 7", "135"]);
-    assert!(output.status.success(), "{output:?}");
-    assert_eq!(peer.asked().len(), 1);
-    assert_eq!(peer.asked()[0].frame, rtu(0, &[6, 0, 7, 0, 135]));
-    let refused = by_hand("read", &line, &["--unit", "0", "holding 7"]);
-    assert_eq!(refused.status.code(), Some(2), "{refused:?}");
-    assert_eq!(peer.asked().len(), 1);
-    peer.hold(1, 3, 7, 4711);
-    let read = by_hand("read", &line, &["--unit", "1", "holding 7"]);
-    assert!(String::from_utf8_lossy(&read.stdout).contains("4711"), "{read:?}");
-}
-
-#[test]
-fn what_a_device_says_of_itself_arrives_whole_in_any_pieces() {
-    let splits: [Misbehave; 3] = [
-        |_, good| vec![Step::Say(good)],
-        |_, good| {
-            let middle = good.len() / 2;
-            vec![Step::Say(good[..middle].to_vec()), Step::Pause(10), Step::Say(good[middle..].to_vec())]
-        },
-        |_, good| in_single_bytes(good),
-    ];
-    for split in splits {
-        let peer = Peer::on_a_pseudo_terminal();
-        peer.misbehave(split);
-        let path = peer.path().display().to_string();
-        let line = ["--serial", &path, "--baud", "115200", "--parity", "none"];
-        let output = by_hand("diagnose", &line, &["--unit", "1", "--json"]);
-        assert!(output.status.success(), "{output:?}");
-        let found: Value = serde_json::from_slice(&output.stdout).expect("JSON");
-        for (name, value) in
-            [("vendor", "ACME"), ("product", "RA1"), ("revision", "1.23"), ("server_id", "42 31 FF")]
-        {
-            assert_eq!(found[name], value, "{name}");
-        }
-        assert_eq!(found["query_returned"], true);
-        assert_eq!(found["bus_messages"], 0);
-    }
-}
-
-fn by_hand(verb: &str, line: &[&str], rest: &[&str]) -> Output {
-    Command::new(program()).arg(verb).args(line).args(rest).output().expect("the program is built")
 }
 
 /// Two units, with points of several kinds.

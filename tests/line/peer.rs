@@ -104,6 +104,16 @@ impl Peer {
         }
     }
 
+    /// The link as a command line says it.
+    pub fn arguments(&self) -> Vec<String> {
+        let text = match (self.port, self.framing) {
+            (0, _) => format!("--serial {} --baud 115200 --parity none", self.path().display()),
+            (port, Framing::Tcp) => format!("--tcp 127.0.0.1:{port}"),
+            (port, Framing::Rtu) => format!("--rtu-over-tcp 127.0.0.1:{port} --baud 115200 --parity none"),
+        };
+        text.split(' ').map(str::to_owned).collect()
+    }
+
     /// Where the serial port is, as long as it is plugged in.
     pub fn path(&self) -> PathBuf {
         self.folder.path().join("line")
