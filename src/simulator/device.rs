@@ -6,8 +6,9 @@ use crate::engine::time::{Duration, Time};
 use crate::simulator::fuehlersysteme::relay8::Relay8;
 use crate::simulator::metz_connect::MetzConnect;
 use crate::simulator::metz_connect::mr_ai8::MrAi8;
+use crate::simulator::metz_connect::mr_ao4::{MrAo4, MrAop4};
 use crate::simulator::metz_connect::mr_di::{MrDi4, MrDi10};
-use crate::simulator::metz_connect::mr_do4::MrDo4;
+use crate::simulator::metz_connect::mr_do4::{MrDo4, MrDoa4};
 use crate::simulator::metz_connect::mr_si4::MrSi4;
 
 /// A device on a line. It opens nothing, waits for nothing and is told the time; a caller may let
@@ -71,6 +72,8 @@ pub enum Overheard {
 pub enum Stimulus {
     /// A hand switch of a relay.
     Hand { relay: u8, position: Hand },
+    /// The hand operation of a voltage output: volts, or `None` for automatic.
+    HandVolts { output: u8, volts: Option<f64> },
     /// What is connected to an input.
     Input { input: u8, signal: Signal },
     /// Somebody presses the button at the device's front.
@@ -156,12 +159,24 @@ pub enum Model {
     MrAi8,
     MrDi4,
     MrDi10,
+    MrDoa4,
+    MrAo4,
+    MrAop4,
     Relay8,
 }
 
 impl Model {
-    pub const ALL: [Model; 6] =
-        [Model::MrDo4, Model::MrSi4, Model::MrAi8, Model::MrDi4, Model::MrDi10, Model::Relay8];
+    pub const ALL: [Model; 9] = [
+        Model::MrDo4,
+        Model::MrSi4,
+        Model::MrAi8,
+        Model::MrDi4,
+        Model::MrDi10,
+        Model::MrDoa4,
+        Model::MrAo4,
+        Model::MrAop4,
+        Model::Relay8,
+    ];
 
     /// The identifier of the device's profile.
     pub const fn id(self) -> &'static str {
@@ -171,6 +186,9 @@ impl Model {
             Model::MrAi8 => "metz-connect/mr-ai8",
             Model::MrDi4 => "metz-connect/mr-di4",
             Model::MrDi10 => "metz-connect/mr-di10",
+            Model::MrDoa4 => "metz-connect/mr-doa4",
+            Model::MrAo4 => "metz-connect/mr-ao4",
+            Model::MrAop4 => "metz-connect/mr-aop4",
             Model::Relay8 => "fuehlersysteme/relay8",
         }
     }
@@ -187,6 +205,9 @@ impl Model {
             Model::MrAi8 => Box::new(MetzConnect::new(now, line, MrAi8::new(now))),
             Model::MrDi4 => Box::new(MetzConnect::new(now, line, MrDi4::new(now))),
             Model::MrDi10 => Box::new(MetzConnect::new(now, line, MrDi10::new(now))),
+            Model::MrDoa4 => Box::new(MetzConnect::new(now, line, MrDoa4::new(now))),
+            Model::MrAo4 => Box::new(MetzConnect::new(now, line, MrAo4::new(now))),
+            Model::MrAop4 => Box::new(MetzConnect::new(now, line, MrAop4::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
         }
     }

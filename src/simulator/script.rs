@@ -30,6 +30,7 @@ pub struct Step {
 
 /// The commands, as the help shows them.
 pub const COMMANDS: &str = "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4)
+  unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
   unit N input I ohms X | volts X | celsius X | open
                                             what is connected to an input (MR-AI8)
   unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10)
@@ -103,6 +104,10 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
             };
             Stimulus::Hand { relay: parse_number("relay", relay)?, position }
         }
+        ["output", output, "hand", setting] => {
+            let volts = if *setting == "automatic" { None } else { Some(parse_finite(setting)?) };
+            Stimulus::HandVolts { output: parse_number("output", output)?, volts }
+        }
         ["input", input, signal @ ..] => {
             Stimulus::Input { input: parse_number("input", input)?, signal: parse_signal(signal)? }
         }
@@ -112,17 +117,13 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
 }
 
 fn parse_signal(words: &[&str]) -> Result<Signal, String> {
-    let finite = |text: &str| match text.parse::<f64>() {
-        Ok(number) if number.is_finite() => Ok(number),
-        _ => Err(format!("`{text}` is not a number")),
-    };
     match words {
         ["open"] | ["contact", "open"] if words.len() == 1 => Ok(Signal::Open),
         ["contact", "open"] => Ok(Signal::Contact(false)),
         ["contact", "closed"] => Ok(Signal::Contact(true)),
-        ["ohms", number] => Ok(Signal::Ohms(finite(number)?)),
-        ["volts", number] => Ok(Signal::Volts(finite(number)?)),
-        ["celsius", number] => Ok(Signal::Celsius(finite(number)?)),
+        ["ohms", number] => Ok(Signal::Ohms(parse_finite(number)?)),
+        ["volts", number] => Ok(Signal::Volts(parse_finite(number)?)),
+        ["celsius", number] => Ok(Signal::Celsius(parse_finite(number)?)),
         ["counter", number] => Ok(Signal::Counter(parse_number("count", number)?)),
         ["pulses", number] => {
             Ok(Signal::Pulses { count: parse_number("count", number)?, every: Duration::from_millis(80) })
@@ -131,6 +132,13 @@ fn parse_signal(words: &[&str]) -> Result<Signal, String> {
             Ok(Signal::Pulses { count: parse_number("count", number)?, every: parse_duration(period)? })
         }
         _ => Err(format!("`{}` is not a signal; there are\n{COMMANDS}", words.join(" "))),
+    }
+}
+
+fn parse_finite(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(number) if number.is_finite() => Ok(number),
+        _ => Err(format!("`{text}` is not a number")),
     }
 }
 
@@ -183,6 +191,16 @@ mod tests {
             ("unit 20 button", 0, stimulate(20, Stimulus::Button)),
             ("unit 18 relay 2 hand on", 0, stimulate(18, Stimulus::Hand { relay: 2, position: Hand::On })),
             ("at 1.5s unit 18 power off", 1500, Action::Power { unit: 18, on: false }),
+            (
+                "unit 21 output 2 hand 5.5",
+                0,
+                stimulate(21, Stimulus::HandVolts { output: 2, volts: Some(5.5) }),
+            ),
+            (
+                "unit 21 output 2 hand automatic",
+                0,
+                stimulate(21, Stimulus::HandVolts { output: 2, volts: None }),
+            ),
             ("unit 18 restart", 0, Action::Restart { unit: 18 }),
             (
                 "unit 18 fault late=700ms,every=2",

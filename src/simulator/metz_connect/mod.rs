@@ -4,11 +4,15 @@
 //! [`MetzConnect`] is that common part around a [`Module`], which is one device's own chapter.
 
 mod channel;
+mod holding;
 pub mod mr_ai8;
+pub mod mr_ao4;
 pub mod mr_di;
 pub mod mr_do4;
 pub mod mr_si4;
 mod sensors;
+mod switches;
+mod watchdog;
 
 use crate::engine::time::Time;
 use crate::simulator::device::{
@@ -259,6 +263,9 @@ mod tests {
             (Model::MrAi8, "MR-AI8 V1.8"),
             (Model::MrDi4, "MR-DI4 V1.4"),
             (Model::MrDi10, "MR-DI10 V1.4"),
+            (Model::MrDoa4, "MR-DO4 V1.4"),
+            (Model::MrAo4, "MR-AO4 V1.4"),
+            (Model::MrAop4, "MR-AOP4 V1.5"),
         ] {
             let (name, version) = product.split_once(' ').expect("a name and a version");
             let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();

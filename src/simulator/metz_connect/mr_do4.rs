@@ -1,178 +1,116 @@
-//! MR-DO4: four relays with hand switches (Softwarebeschreibung Modbus RTU V2.1, pages 6 to 9).
+//! MR-DO4 and MR-DOA4: four relays, with and without hand switches (Softwarebeschreibung Modbus RTU
+//! V2.1, pages 6 to 9).
 
-use crate::engine::time::{Duration, Time};
-use crate::simulator::device::{Hand, Stimulus};
+use crate::engine::time::Time;
+use crate::simulator::device::Stimulus;
 use crate::simulator::metz_connect::Module;
-use crate::simulator::pdu::{Exception, Request, bits_reply, check_span, words_reply, write_reply};
+use crate::simulator::metz_connect::holding::HoldingRegisters;
+use crate::simulator::metz_connect::switches::{Switches, named, read_coils};
+use crate::simulator::metz_connect::watchdog::{WATCHDOG, Watchdog};
+use crate::simulator::pdu::{Exception, Request, check_span};
 
-/// The four relays.
-pub struct MrDo4 {
+/// The four relays. The chapter tells both devices together; all it says of MR-DOA4 alone is that
+/// coils 4 to 7 are 0, which is why it has no hand switches here.
+pub struct Relays<const HAND_SWITCHES: bool> {
+    switches: Switches,
     /// Register 1: each relay's state after a reset and when the communication fails. EEPROM.
     defaults: u8,
-    /// Register 66: the watchdog in units of 10 ms, 0 is off. EEPROM.
-    watchdog: u16,
-    /// What the bus last asked of the relays, bit 0 is relay 1.
-    commanded: u8,
-    hands: [Hand; RELAYS],
-    last_message: Time,
-    watchdog_expired: bool,
+    watchdog: Watchdog,
 }
 
-const RELAYS: usize = 4;
-const WATCHDOG_UNIT: Duration = Duration::from_millis(10);
-const WATCHDOG_REGISTER: u16 = 66;
+pub type MrDo4 = Relays<true>;
+pub type MrDoa4 = Relays<false>;
 
-impl MrDo4 {
-    pub fn new(now: Time) -> MrDo4 {
-        MrDo4 {
-            defaults: 0,
-            watchdog: 0,
-            commanded: 0,
-            hands: [Hand::Automatic; RELAYS],
-            last_message: now,
-            watchdog_expired: false,
-        }
+impl<const HAND_SWITCHES: bool> Relays<HAND_SWITCHES> {
+    pub fn new(now: Time) -> Relays<HAND_SWITCHES> {
+        Relays { switches: Switches::new(), defaults: 0, watchdog: Watchdog::new(now) }
     }
 
     /// Coils 0 to 7 and register 0: bits 0 to 3 the relays, bits 4 to 7 "manuell geschalten".
     fn status(&self) -> u8 {
-        let mut status = 0;
-        for (relay, hand) in self.hands.iter().enumerate() {
-            let (on, by_hand) = match hand {
-                Hand::Automatic => (self.commanded >> relay & 1 == 1, false),
-                Hand::On => (true, true),
-                Hand::Off => (false, true),
-            };
-            status |= u8::from(on) << relay | u8::from(by_hand) << (relay + RELAYS);
-        }
-        status
+        self.switches.status(self.switches.commanded)
     }
+}
 
-    fn command(&mut self, relay: usize, on: bool) {
-        self.commanded = self.commanded & !(1 << relay) | u8::from(on) << relay;
-    }
-
-    /// One of the registers 0, 1 and 66. Of 0 and 1 only bits 0 to 3 count (page 9).
-    fn write(&mut self, register: u16, word: u16) {
-        match register {
-            0 => self.commanded = word as u8 & 0x0F,
-            1 => self.defaults = word as u8 & 0x0F,
-            _ => self.watchdog = word,
-        }
+impl<const HAND_SWITCHES: bool> HoldingRegisters for Relays<HAND_SWITCHES> {
+    /// "Gültige Register Startadresse 0..1 oder 66, gültige Anzahl 2 oder 1" (pages 7 and 9).
+    fn check(first: u16, count: usize) -> Result<(), Exception> {
+        let allowed = if first == WATCHDOG { (first, first) } else { (0, 1) };
+        check_span(first, count, 2, allowed)
     }
 
     fn read(&self, register: u16) -> u16 {
         match register {
-            0 => u16::from(self.status()),
-            1 => u16::from(self.defaults),
-            _ => self.watchdog,
+            0 => self.status().into(),
+            1 => self.defaults.into(),
+            _ => self.watchdog.time,
         }
+    }
+
+    /// Of 0 and 1 only bits 0 to 3 count (page 9).
+    fn write(&mut self, _now: Time, first: u16, words: &[u16]) -> Result<(), Exception> {
+        for (register, word) in (first..).zip(words) {
+            match register {
+                0 => self.switches.commanded = *word as u8 & 0x0F,
+                1 => self.defaults = *word as u8 & 0x0F,
+                _ => self.watchdog.time = *word,
+            }
+        }
+        Ok(())
     }
 }
 
-/// "Gültige Register Startadresse 0..1 oder 66, gültige Anzahl 2 oder 1" (pages 7 and 9).
-fn check_registers(first: u16, count: usize) -> Result<(), Exception> {
-    let allowed = if first == WATCHDOG_REGISTER { (first, first) } else { (0, 1) };
-    check_span(first, count, 2, allowed)
-}
-
-impl Module for MrDo4 {
+impl<const HAND_SWITCHES: bool> Module for Relays<HAND_SWITCHES> {
+    /// Of both devices: page 9 gives this text for the whole chapter.
     const PRODUCT: &'static str = "MR-DO4";
     const VERSION: &'static str = "V1.4";
     const FUNCTIONS: &'static [u8] = &[1, 3, 5, 6, 15, 16];
 
-    fn serve(&mut self, _now: Time, request: &Request) -> Result<Vec<u8>, Exception> {
+    fn serve(&mut self, now: Time, request: &Request) -> Result<Vec<u8>, Exception> {
         match *request {
-            Request::Read { function: 1, first, count } => {
-                check_span(first, count.into(), 8, (0, 7))?;
-                let status = self.status();
-                let bits: Vec<bool> = (first..first + count).map(|bit| status >> bit & 1 == 1).collect();
-                Ok(bits_reply(1, &bits))
-            }
-            Request::Read { function, first, count } => {
-                check_registers(first, count.into())?;
-                let words: Vec<u16> = (first..first + count).map(|register| self.read(register)).collect();
-                Ok(words_reply(function, &words))
-            }
-            Request::WriteCoil { address, value } => {
-                if value != 0 && value != 0xFF00 {
-                    return Err(Exception::Value);
-                }
-                check_span(address, 1, 1, (0, 3))?;
-                self.command(address.into(), value != 0);
-                Ok(write_reply(5, address, value))
-            }
-            Request::WriteCoils { first, ref values } => {
-                check_span(first, values.len(), 4, (0, 3))?;
-                for (number, on) in values.iter().enumerate() {
-                    self.command(usize::from(first) + number, *on);
-                }
-                Ok(write_reply(15, first, values.len() as u16))
-            }
-            Request::WriteRegister { address, word } => {
-                check_registers(address, 1)?;
-                self.write(address, word);
-                Ok(write_reply(6, address, word))
-            }
-            Request::WriteRegisters { first, ref words } => {
-                check_registers(first, words.len())?;
-                for (register, word) in (first..).zip(words) {
-                    self.write(register, *word);
-                }
-                Ok(write_reply(16, first, words.len() as u16))
-            }
-            Request::Diagnostics { .. } | Request::Encapsulated { .. } => Err(Exception::Function),
+            Request::Read { function: 1, first, count } => read_coils(self.status(), first, count),
+            Request::WriteCoil { .. } | Request::WriteCoils { .. } => self.switches.write_coils(request),
+            _ => self.serve_holding(now, request),
         }
     }
 
     fn message_for_this_device(&mut self, now: Time) {
-        self.last_message = now;
-        self.watchdog_expired = false;
+        self.watchdog.feed(now);
     }
 
     fn advance(&mut self, now: Time) {
-        let timeout = WATCHDOG_UNIT * self.watchdog.into();
-        if self.watchdog > 0 && !self.watchdog_expired && now.since(self.last_message) >= timeout {
-            self.watchdog_expired = true;
-            self.commanded = self.defaults;
+        if self.watchdog.expires(now) {
+            self.switches.commanded = self.defaults;
         }
     }
 
     fn restart(&mut self, now: Time) {
-        self.commanded = self.defaults;
-        self.last_message = now;
-        self.watchdog_expired = false;
+        self.switches.commanded = self.defaults;
+        self.watchdog.feed(now);
     }
 
     fn stimulate(&mut self, _now: Time, stimulus: &Stimulus) -> Result<(), String> {
-        match stimulus {
-            Stimulus::Hand { relay: relay @ 1..=4, position } => {
-                self.hands[usize::from(*relay) - 1] = *position;
-                Ok(())
-            }
-            Stimulus::Hand { relay, .. } => Err(format!("relay {relay} is not there; MR-DO4 has 1 to 4")),
-            _ => Err("MR-DO4 has relays with hand switches and nothing else to touch".into()),
+        if HAND_SWITCHES {
+            self.switches.stimulate(stimulus, "MR-DO4", "relays")
+        } else {
+            Err("MR-DOA4 has relays without hand switches and nothing to touch".into())
         }
     }
 
     fn outputs(&self) -> Vec<(String, String)> {
         let status = self.status();
-        let name = |on: bool| if on { "ON" } else { "OFF" }.to_string();
-        let relays =
-            (0..RELAYS).map(|relay| (format!("relay_{}", relay + 1), name(status >> relay & 1 == 1)));
-        let hands = (0..RELAYS)
-            .map(|relay| (format!("hand_{}", relay + 1), name(status >> (relay + RELAYS) & 1 == 1)));
-        relays.chain(hands).collect()
+        let hands = HAND_SWITCHES.then(|| named("hand", status >> 4));
+        named("relay", status).chain(hands.into_iter().flatten()).collect()
     }
 
     fn eeprom(&self) -> Vec<u16> {
-        vec![self.defaults.into(), self.watchdog]
+        vec![self.defaults.into(), self.watchdog.time]
     }
 
     fn load_eeprom(&mut self, words: &[u16]) {
         if let [defaults, watchdog] = *words {
             self.defaults = defaults as u8 & 0x0F;
-            self.watchdog = watchdog;
+            self.watchdog.time = watchdog;
         }
     }
 }
@@ -306,5 +244,26 @@ mod tests {
         other.device.load_eeprom(other.now, &kept).expect("an EEPROM of the same device");
         other.check(&[("03 0000 0002", "03 04 0004 0004")]);
         assert!(other.device.load_eeprom(other.now, &kept[1..]).is_err());
+    }
+
+    #[test]
+    fn mr_doa4_is_mr_do4_with_coils_4_to_7_always_0_page_6() {
+        let mut bench = Bench::new(Model::MrDoa4);
+        assert!(bench.act("relay 2 hand on").is_err());
+        bench.check(&[
+            ("0F 0000 0004 01 0F", "0F 0000 0004"),
+            ("01 0000 0008", "01 01 0F"),
+            ("01 0004 0004", "01 01 00"),
+            ("01 0007 0001", "01 01 00"),
+            ("05 0004 FF00", "85 02"),
+            ("06 0000 00F5", "06 0000 00F5"),
+            ("06 0001 0002", "06 0001 0002"),
+            ("03 0000 0002", "03 04 0005 0002"),
+            ("06 0042 0064", "06 0042 0064"),
+        ]);
+        bench.wait(1000);
+        bench.check(&[("01 0000 0008", "01 01 02")]);
+        bench.act("restart").expect("a restart");
+        bench.check(&[("03 0042 0001", "03 02 0064"), ("03 0000 0001", "03 02 0002")]);
     }
 }

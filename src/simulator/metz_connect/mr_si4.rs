@@ -290,7 +290,7 @@ impl Module for MrSi4 {
                 Ok(())
             }
             Stimulus::Input { input, .. } => Err(format!("input {input} is not there; MR-SI4 has 1 to 4")),
-            Stimulus::Hand { .. } => Err("MR-SI4 has inputs and a button, no relays".into()),
+            _ => Err("MR-SI4 has inputs and a button, no relays".into()),
         }
     }
 
