@@ -6,7 +6,7 @@ mod telling;
 use crate::engine::command::{Outcome, OutcomeKind, words_of};
 use crate::engine::device::{Device, Identify, Point, PointIndex};
 use crate::engine::health::Counters;
-use crate::engine::homeassistant::Announcement;
+use crate::engine::homeassistant::{self, Announcement};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::{self, Cost, Read};
 use crate::engine::schedule::{Polls, Urgency};
@@ -231,7 +231,10 @@ impl DeviceState {
     /// Before anything is known: what an earlier run left at the broker is taken back.
     pub(super) fn introduce(&mut self, now: Time, context: &mut Context) {
         self.publish_availability(false, context);
-        self.announce(context);
+        // Less than all would take entities away that were announced before the start.
+        if homeassistant::is_settled(&self.settings.device, self.values.known()) {
+            self.announce(context);
+        }
         self.tell_all(now, context);
         self.tell_info(context);
     }

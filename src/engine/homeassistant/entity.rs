@@ -8,7 +8,7 @@ use crate::engine::device::{
     Category, Device, Encoding, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
 };
 use crate::engine::units;
-use crate::engine::value::Decimal;
+use crate::engine::value::{Decimal, Missing};
 
 /// One entity, without topics.
 #[derive(Clone, Debug, PartialEq)]
@@ -147,6 +147,12 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
         }
     }
     Some(entity)
+}
+
+/// Whether enough is known to say which entities there are: no point waits for another one.
+pub fn is_settled(device: &Device, known: &[Option<i128>]) -> bool {
+    (0..device.points.len())
+        .all(|point| !matches!(codec::resolve(device, point, known), Err(Missing::WaitingFor(_))))
 }
 
 /// The buttons that stand beside an entity: one for each name that can be written to the point and

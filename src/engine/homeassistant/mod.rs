@@ -9,5 +9,5 @@ mod entity;
 mod gateway;
 
 pub use announcement::{Announcement, Gateway, announcement, farewell};
-pub use entity::{Entity, companions, entity};
+pub use entity::{Entity, companions, entity, is_settled};
 pub use gateway::{announce_bridge, announce_bus};
