@@ -20,6 +20,7 @@ use crate::engine::bus::{Bus, Command, Event};
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::health::{self, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
+use crate::engine::outbox::Outbox;
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 use crate::engine::topics::{Message, Topics};
@@ -60,7 +61,9 @@ impl App {
             None => None,
         };
         let topics = Topics::new(&settings.mqtt.base_topic);
-        let mailbox = Arc::new(Mailbox::new(topics.clone(), &settings.home_assistant.prefix));
+        let outbox =
+            Outbox::new(topics.clone(), &settings.home_assistant.prefix, identities(&settings, &topics));
+        let mailbox = Arc::new(Mailbox::new(outbox));
         introduce(&settings, &topics, &mailbox);
         let buses = Arc::new(start_buses(&settings, clock, &mailbox)?);
 
@@ -113,6 +116,13 @@ impl App {
         // A stuck bus's thread is not waited for again.
         self.runtime.shutdown_background();
     }
+}
+
+/// Everything that Home Assistant may know of this gateway.
+fn identities(settings: &Settings, topics: &Topics) -> Vec<String> {
+    let buses = settings.buses.iter().map(|bus| topics.bus_identity(&bus.name));
+    let devices = settings.devices.iter().map(|device| topics.identity(&device.name));
+    buses.chain(devices).chain([topics.bridge_identity()]).collect()
 }
 
 /// What is known of the gateway before anything has happened.

@@ -15,7 +15,7 @@ use crate::engine::health::BrokerReport;
 use crate::engine::outbox::Outbox;
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
-use crate::engine::topics::{Incoming, Message, OFFLINE, ONLINE, Topics};
+use crate::engine::topics::{self, Incoming, Message, OFFLINE, ONLINE, Topics};
 
 /// Requests that the library may hold; the others wait in the outbox, where a newer value replaces an
 /// older one.
@@ -41,8 +41,8 @@ pub struct Mailbox {
 }
 
 impl Mailbox {
-    pub fn new(topics: Topics, discovery_prefix: &str) -> Mailbox {
-        Mailbox { outbox: Mutex::new(Outbox::new(topics, discovery_prefix)), news: Notify::new() }
+    pub fn new(outbox: Outbox) -> Mailbox {
+        Mailbox { outbox: Mutex::new(outbox), news: Notify::new() }
     }
 
     /// Never waits for the broker.
@@ -107,6 +107,8 @@ impl Broker {
         let mut filters = topics.subscriptions();
         if settings.home_assistant.discovery {
             filters.push(settings.home_assistant.status_topic.clone());
+            // What an earlier run announced, to take away what is gone.
+            filters.push(topics::discovery(&settings.home_assistant.prefix, "+"));
         }
         let feeder = Feeder {
             client,
@@ -317,6 +319,12 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             if payload == ONLINE && !retained {
                 tracing::info!("Home Assistant has started: announcing all devices again");
                 self.mailbox.outbox().home_assistant_started(self.clock.now());
+            }
+            return;
+        }
+        if topic.ends_with("/config") {
+            if retained {
+                self.mailbox.outbox().found(topic, &payload);
             }
             return;
         }

@@ -2,10 +2,11 @@
 //! messages that are told once. The client library forgets what it has not sent when the connection
 //! breaks; this does not.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
+use crate::engine::homeassistant::{self, Announcement};
 use crate::engine::time::{Duration, Time};
-use crate::engine::topics::{Message, OFFLINE, ONLINE, Topics};
+use crate::engine::topics::{self, Message, OFFLINE, ONLINE, Topics};
 
 /// Messages told once that may wait; more push out the oldest.
 const ONCE_MAX: usize = 256;
@@ -20,6 +21,10 @@ pub struct Outbox {
     topics: Topics,
     /// Topics that begin so are discovery.
     discovery_prefix: String,
+    /// The discovery topics of all that this gateway has, announced already or not.
+    own_devices: BTreeSet<String>,
+    /// What an earlier run announced of devices that this one has not announced yet.
+    remembered: BTreeMap<String, Announcement>,
     retained: BTreeMap<String, Retained>,
     queue: VecDeque<Queued>,
     once_waiting: usize,
@@ -41,14 +46,24 @@ enum Queued {
     /// Whatever the topic's newest payload is when its turn comes.
     Newest(String),
     Once(Message),
+    /// The topic shall be forgotten by the broker.
+    Removal(String),
 }
 
 impl Outbox {
-    /// `discovery_prefix` is Home Assistant's, `homeassistant`.
-    pub fn new(topics: Topics, discovery_prefix: &str) -> Outbox {
+    /// `discovery_prefix` is Home Assistant's, `homeassistant`; `identities` are those of everything
+    /// that this gateway has: itself, its buses and its devices.
+    pub fn new(
+        topics: Topics,
+        discovery_prefix: &str,
+        identities: impl IntoIterator<Item = String>,
+    ) -> Outbox {
+        let own = identities.into_iter().map(|identity| topics::discovery(discovery_prefix, &identity));
         Outbox {
             topics,
             discovery_prefix: format!("{discovery_prefix}/device/"),
+            own_devices: own.collect(),
+            remembered: BTreeMap::new(),
             retained: BTreeMap::new(),
             queue: VecDeque::new(),
             once_waiting: 0,
@@ -75,6 +90,7 @@ impl Outbox {
                     self.once_waiting -= 1;
                     return Some(message);
                 }
+                Queued::Removal(topic) => return Some(Message::retained(topic, "")),
                 Queued::Newest(topic) => {
                     if let Some(entry) = self.retained.get_mut(&topic) {
                         entry.queued = false;
@@ -96,6 +112,35 @@ impl Outbox {
                 entry.queued = true;
                 self.queue.push_front(Queued::Newest(message.topic));
             }
+        } else {
+            self.queue.push_front(Queued::Removal(message.topic));
+        }
+    }
+
+    /// The broker remembers this announcement, perhaps of an earlier run. What it holds and we do not
+    /// have any more is taken away properly; announcements that are not ours are left alone.
+    pub fn found(&mut self, topic: &str, payload: &str) {
+        let Some(found) = Announcement::parse(&self.topics, topic, payload) else { return };
+        if self.retained.contains_key(topic) {
+            self.take_leave(found);
+        } else if self.own_devices.contains(topic) {
+            self.remembered.insert(topic.to_string(), found);
+        } else {
+            self.queue.push_back(Queued::Removal(topic.to_string()));
+        }
+    }
+
+    /// Buries what `found` has and the present announcement on its topic has not.
+    fn take_leave(&mut self, found: Announcement) {
+        let Some(entry) = self.retained.get(found.topic()) else { return };
+        let topic = found.topic();
+        let Some(present) = Announcement::parse(&self.topics, topic, &entry.payload) else { return };
+        if let Some(farewell) = homeassistant::farewell(&found, &present) {
+            let message = Message::retained(topic, entry.payload.clone());
+            // Home Assistant may have started since then, and buries only what it knows.
+            self.push_once(Message { retain: false, ..found.message() });
+            self.push_once(farewell);
+            self.push_retained(message);
         }
     }
 
@@ -108,7 +153,7 @@ impl Outbox {
             .into_iter()
             .filter_map(|queued| match queued {
                 Queued::Once(message) => Some(message),
-                Queued::Newest(_) => None,
+                Queued::Newest(_) | Queued::Removal(_) => None,
             })
             .collect();
         for topic in self.in_order(|_| true) {
@@ -167,7 +212,10 @@ impl Outbox {
         entry.payload = message.payload;
         if !entry.queued {
             entry.queued = true;
-            self.queue.push_back(Queued::Newest(message.topic));
+            self.queue.push_back(Queued::Newest(message.topic.clone()));
+        }
+        if let Some(found) = self.remembered.remove(&message.topic) {
+            self.take_leave(found);
         }
     }
 
@@ -242,7 +290,8 @@ mod tests {
     use super::*;
 
     fn outbox() -> Outbox {
-        Outbox::new(Topics::new("busker"), "homeassistant")
+        let identities = ["busker_bridge", "busker_boiler"].map(String::from);
+        Outbox::new(Topics::new("busker"), "homeassistant", identities)
     }
 
     fn retained(outbox: &mut Outbox, topic: &str, payload: &str) {
@@ -354,6 +403,51 @@ mod tests {
         assert_eq!(outbox.next_message(), Some(Message::retained("busker/a/x", "1")));
         assert_eq!(outbox.next_message(), Some(Message::once("busker/a/x/outcome", "3")));
         assert_eq!(std::iter::from_fn(|| outbox.next_message()).count(), ONCE_MAX - 1);
+    }
+
+    /// What this gateway announces of a device with these components.
+    fn announcement(keys: &[&str]) -> String {
+        let components: Vec<String> =
+            keys.iter().map(|key| format!("\"{key}\":{{\"platform\":\"sensor\"}}")).collect();
+        format!(
+            "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
+             \"components\":{{{}}}}}",
+            components.join(",")
+        )
+    }
+
+    #[test]
+    fn what_an_earlier_run_announced_and_is_gone_is_taken_away() {
+        let config = "homeassistant/device/busker_boiler/config";
+        let (old, new) = (announcement(&["flow", "level"]), announcement(&["level"]));
+        // `flow` stands there as a tombstone, behind what is left.
+        let farewell = announcement(&["level", "flow"]);
+        let expected =
+            [format!("{config} {old}!"), format!("{config} {farewell}!"), format!("{config} {new}")];
+        let expected: Vec<&str> = expected.iter().map(String::as_str).collect();
+
+        // Found before it is announced anew, and after.
+        let mut early = outbox();
+        early.found(config, &old);
+        check_sent(&mut early, &[]);
+        retained(&mut early, config, &new);
+        check_sent(&mut early, &expected);
+        let mut late = outbox();
+        retained(&mut late, config, &new);
+        assert!(late.next_message().is_some());
+        late.found(config, &old);
+        check_sent(&mut late, &expected);
+        late.found(config, &new);
+        check_sent(&mut late, &[]);
+
+        // A device that is no longer there goes whole, once; others' are left alone.
+        let mut outbox = outbox();
+        outbox.found("homeassistant/device/busker_gone/config", &old);
+        outbox.found("homeassistant/device/busker_2_gone/config", &old.replace("busker/", "busker_2/"));
+        outbox.found("homeassistant/device/stranger/config", "{}");
+        let removal = outbox.next_message().expect("the device is removed");
+        outbox.put_back(removal);
+        check_sent(&mut outbox, &["homeassistant/device/busker_gone/config "]);
     }
 
     #[test]

@@ -286,6 +286,53 @@ fn the_last_will_says_offline_when_the_gateway_is_killed() {
 }
 
 #[test]
+fn what_the_configuration_has_no_more_is_taken_from_home_assistant() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let watcher = Watcher::start(&broker, "watcher");
+    let board = |points: &str| {
+        format!(
+            "buses: {{line: {{tcp: '{}'}}}}\ndevices:\n  board: {{bus: line, unit: 18, points: {{{points}}}}}\n",
+            port.address()
+        )
+    };
+    let both = board("one: {at: coil 0, poll: fast}, two: {at: coil 1, poll: fast}");
+    let counters = "  counters: {profile: metz-connect/mr-si4, bus: line, unit: 20}\n";
+    let config = "homeassistant/device/busker_board/config";
+    let gateway = Gateway::start(&broker, &format!("{both}{counters}"));
+    watcher.wait_for("busker/board/availability", "online");
+    watcher.wait_for("busker/counters/availability", "online");
+    assert!(gateway.terminate().success());
+    watcher.publish_retained("homeassistant/device/somebody/config", "{}");
+    watcher.wait_for("homeassistant/device/somebody/config", "{}");
+    let before = payload(&remembered(&broker, "between"), config).to_string();
+
+    watcher.forget();
+    let _gateway = Gateway::start(&broker, &board("one: {at: coil 0, poll: fast}"));
+    watcher.wait_until("the removal of the counters", |got| {
+        got.topic == "homeassistant/device/busker_counters/config" && got.payload.is_empty()
+    });
+    let tombstone = serde_json::json!({"platform": "binary_sensor"});
+    let buried = |got: &Received| got.topic == config && json(&got.payload)["components"]["two"] == tombstone;
+    watcher.wait_until("the burial of the point", buried);
+    let told = || -> Vec<String> {
+        watcher.received().into_iter().filter(|got| got.topic == config).map(|got| got.payload).collect()
+    };
+    let is_without = |payload: &String| json(payload)["components"].get("two").is_none();
+    rig::eventually(|| told().last().is_some_and(is_without).then_some(()))
+        .expect("it ends without the point");
+    let told = told();
+    let at = told.iter().position(|payload| json(payload)["components"]["two"] == tombstone);
+    let at = at.expect("it was buried");
+    assert_eq!(told[at - 1], before, "Home Assistant buries only what it knows");
+
+    let all = remembered(&broker, "after");
+    assert!(json(payload(&all, config))["components"].get("two").is_none());
+    assert!(!all.iter().any(|got| got.topic == "homeassistant/device/busker_counters/config"));
+    assert_eq!(payload(&all, "homeassistant/device/somebody/config"), "{}");
+}
+
+#[test]
 fn http_tells_how_everything_is() {
     let (broker, simulation) = (Broker::start(), simulation());
     let port = over_tcp(&simulation);

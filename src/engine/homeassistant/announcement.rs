@@ -60,6 +60,29 @@ impl Announcement {
         Announcement { topic: topics::discovery(&gateway.prefix, identity), head, components }
     }
 
+    /// An announcement that this gateway has published, perhaps in an earlier run; `None` for anybody
+    /// else's. Whose it is shows in the topics, since one gateway's identities may begin like
+    /// another's.
+    pub fn parse(topics: &Topics, topic: &str, payload: &str) -> Option<Announcement> {
+        let Value::Object(mut head) = serde_json::from_str(payload).ok()? else { return None };
+        let Value::Object(components) = head.remove("components")? else { return None };
+        let components: Components = components
+            .into_iter()
+            .filter_map(|(key, component)| match component {
+                Value::Object(component) => Some((key, component)),
+                _ => None,
+            })
+            .collect();
+        let bridge_state = topics.bridge_state();
+        let available_by = head.get("availability").and_then(Value::as_array).into_iter().flatten();
+        let mut named = available_by
+            .filter_map(|entry| entry.get("topic"))
+            .chain(components.iter().filter_map(|(_, component)| component.get("state_topic")));
+        let ours = head.get("origin")?.get("name")? == "busker"
+            && named.any(|named| named.as_str() == Some(bridge_state.as_str()));
+        ours.then(|| Announcement { topic: topic.into(), head, components })
+    }
+
     pub fn topic(&self) -> &str {
         &self.topic
     }
@@ -283,6 +306,22 @@ mod tests {
 
         let message = farewell(&announced(Some(1)), &announced(Some(2))).expect("V is dropped");
         assert_eq!(payload(&message)["components"]["input_v"], json!({"platform": "sensor"}));
+    }
+
+    #[test]
+    fn an_announcement_is_known_again_by_the_gateway_that_made_it() {
+        let message = announced(Some(0)).message();
+        let parse = |base: &str| Announcement::parse(&Topics::new(base), &message.topic, &message.payload);
+        assert_eq!(parse("busker"), Some(announced(Some(0))));
+        assert_eq!(parse("busker_2"), None);
+        let bridge = announce_bridge(&gateway());
+        let message = bridge.message();
+        let parse = |payload: &str| Announcement::parse(&gateway().topics, &message.topic, payload);
+        assert_eq!(parse(&message.payload), Some(bridge));
+        for strange in ["", "{}", "[]", "{\"components\":1}", "{\"components\":{}}", "nonsense"] {
+            assert_eq!(parse(strange), None, "{strange}");
+        }
+        assert_eq!(parse(&message.payload.replace("\"name\":\"busker\"", "\"name\":\"other\"")), None);
     }
 
     #[test]
