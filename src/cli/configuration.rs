@@ -58,7 +58,9 @@ pub fn load(path: &Path) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
     }
     match configuration::load(&shown, &bytes, &library) {
         Ok((mut settings, warnings)) if unreadable.is_empty() => {
-            settings.mqtt.password = password(settings.mqtt.password);
+            let environment = env::var("BUSKER_MQTT_PASSWORD").ok();
+            let credentials = env::var_os("CREDENTIALS_DIRECTORY").map(PathBuf::from);
+            settings.mqtt.password = password(settings.mqtt.password, environment, credentials);
             Ok(Ok(Loaded { settings, warnings, library }))
         }
         Ok(_) => Ok(Err(unreadable)),
@@ -88,17 +90,30 @@ pub fn add_profiles(library: &mut Library, root: &Path, folder: &Path) -> std::i
 }
 
 /// The configuration's password, else that of the environment, else systemd's credential.
-fn password(configured: Password) -> Password {
-    if configured != Password::None {
-        return configured;
+fn password(configured: Password, environment: Option<String>, credentials: Option<PathBuf>) -> Password {
+    let credential = credentials.map(|folder| folder.join("mqtt-password")).filter(|path| path.exists());
+    match (configured, environment, credential) {
+        (Password::None, Some(password), _) => Password::Given(password),
+        (Password::None, None, Some(path)) => Password::File(path),
+        (configured, _, _) => configured,
     }
-    if let Ok(password) = env::var("BUSKER_MQTT_PASSWORD") {
-        return Password::Given(password);
-    }
-    let credential =
-        env::var_os("CREDENTIALS_DIRECTORY").map(|folder| Path::new(&folder).join("mqtt-password"));
-    match credential {
-        Some(path) if path.exists() => Password::File(path),
-        _ => Password::None,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_password_comes_from_the_nearest_place_that_has_one() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let credentials = || Some(folder.path().to_path_buf());
+        let given = |password: &str| Password::Given(password.into());
+        assert!(password(Password::None, None, None) == Password::None);
+        assert!(password(Password::None, None, credentials()) == Password::None);
+        fs::write(folder.path().join("mqtt-password"), "c").expect("a credential");
+        let file = Password::File(folder.path().join("mqtt-password"));
+        assert!(password(Password::None, None, credentials()) == file);
+        assert!(password(Password::None, Some("e".into()), credentials()) == given("e"));
+        assert!(password(given("f"), Some("e".into()), credentials()) == given("f"));
     }
 }
