@@ -14,6 +14,8 @@ pub struct Values {
     known: Vec<Option<i128>>,
     /// For each point, those that it decides.
     dependents: Vec<Vec<PointIndex>>,
+    /// What is missing, or why, has changed since it was last asked.
+    missing_changed: bool,
 }
 
 #[derive(Clone, Debug)]
@@ -43,7 +45,7 @@ impl Values {
             }
         }
         let unknown = Value { reading: Reading::Missing(Missing::NotYetRead), read_at: None, told: None };
-        Values { values: vec![unknown; count], known: vec![None; count], dependents }
+        Values { values: vec![unknown; count], known: vec![None; count], dependents, missing_changed: true }
     }
 
     /// What the selectors say, for [`codec::resolve`].
@@ -86,7 +88,7 @@ impl Values {
                     absorbed.unnamed.push((point, raw));
                 }
             }
-            self.values[point].reading = reading;
+            self.set(point, reading);
             self.values[point].read_at = Some(now);
             absorbed.dropped.retain(|dropped| *dropped != point);
         }
@@ -108,7 +110,7 @@ impl Values {
                 Ok(_) => Missing::NotYetRead,
                 Err(missing) => missing,
             };
-            self.values[dependent].reading = Reading::Missing(missing);
+            self.set(dependent, Reading::Missing(missing));
             if !dropped.contains(&dependent) {
                 dropped.push(dependent);
             }
@@ -121,15 +123,27 @@ impl Values {
 
     /// There is no reading of this point now.
     pub fn lose(&mut self, point: PointIndex, missing: Missing) {
-        self.values[point].reading = Reading::Missing(missing);
+        self.set(point, Reading::Missing(missing));
     }
 
     /// The device is gone, and with it everything that was known of it.
     pub fn lose_all(&mut self, missing: Missing) {
         self.known.fill(None);
-        for value in &mut self.values {
-            value.reading = Reading::Missing(missing.clone());
+        for point in 0..self.values.len() {
+            self.set(point, Reading::Missing(missing.clone()));
         }
+    }
+
+    fn set(&mut self, point: PointIndex, reading: Reading) {
+        let before = std::mem::replace(&mut self.values[point].reading, reading);
+        let is_missing = |reading: &Reading| matches!(reading, Reading::Missing(_));
+        let now = &self.values[point].reading;
+        self.missing_changed |= (is_missing(&before) || is_missing(now)) && before != *now;
+    }
+
+    /// Whether what is missing, or why, has changed since this was last called.
+    pub fn take_missing_changed(&mut self) -> bool {
+        std::mem::take(&mut self.missing_changed)
     }
 
     /// The text to publish for this point now: if it differs from what was told last (by at least the

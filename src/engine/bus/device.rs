@@ -45,6 +45,8 @@ pub(super) struct DeviceState {
     identity: Option<String>,
     told_available: Option<bool>,
     told_info: String,
+    /// The last info said that the device is there.
+    told_present: bool,
     announced: Option<Announcement>,
     announcement_due: bool,
     /// A `get` or a command wants these told even if they have not changed.
@@ -89,6 +91,7 @@ impl DeviceState {
             identity: None,
             told_available: None,
             told_info: String::new(),
+            told_present: false,
             announced: None,
             announcement_due: true,
             tell_anyway: Vec::new(),
@@ -412,7 +415,9 @@ impl DeviceState {
                 self.announce(context);
             }
             self.publish_availability(true, context);
-            self.tell_info(context);
+            if self.values.take_missing_changed() || !self.told_present {
+                self.tell_info(context);
+            }
         }
     }
 

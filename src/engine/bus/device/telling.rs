@@ -96,6 +96,7 @@ impl DeviceState {
             "missing": missing,
         })
         .to_string();
+        self.told_present = self.presence == Presence::Present;
         if info != self.told_info {
             let topic = context.gateway.topics.info(&self.settings.name);
             context.publish(Message::retained(topic, info.clone()));
