@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::engine::address::{Address, Bits, Span, Table};
-use crate::engine::device::{Order, Poll, Write};
-use crate::engine::test_device::{device_of, point};
+use crate::engine::device::{Order, Point, Poll, Write};
+use crate::engine::test_device::device_of;
 
 fn decimal(text: &str) -> Decimal {
     Decimal::parse(text).expect("a decimal in a test")
@@ -15,7 +15,7 @@ fn words(hex: &str) -> Vec<u16> {
 
 /// A device of one writable point at `holding 0` in this form.
 fn device(form: Form, at: Address, rule: WriteRule) -> Device {
-    let mut point = point("point", at, Poll::Fast);
+    let mut point = Point::new("point", at, Poll::Fast);
     point.encoding = Encoding::Plain(form);
     point.write = Some(Write { at, with: None, rule });
     device_of(vec![point])

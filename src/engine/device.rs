@@ -10,7 +10,7 @@ use crate::engine::value::Decimal;
 pub type PointIndex = usize;
 
 /// One type of device, or one device with its owner's wishes applied.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Device {
     /// The profile's identifier, `metz-connect/mr-do4`; `inline` for points from the configuration.
     pub profile: String,
@@ -35,7 +35,7 @@ pub enum Identify {
 }
 
 /// How the device behaves on the wire.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Wire {
     pub limits: Limits,
     /// A read must lie within one of these; empty: anywhere.
@@ -140,6 +140,26 @@ pub struct Point {
 }
 
 impl Point {
+    /// A point that is read here as a `u16` (in a table of bits as a flag) and not written: the point
+    /// from which others differ.
+    pub fn new(name: &str, at: Address, poll: Poll) -> Point {
+        let kind = if at.span.table().is_bits() { Kind::Bool } else { Kind::U16 };
+        Point {
+            name: name.into(),
+            at,
+            also: None,
+            encoding: Encoding::Plain(Form::new(kind)),
+            poll,
+            write: None,
+            persistent: false,
+            read_clears: false,
+            default: None,
+            re_read: Vec::new(),
+            deadband: None,
+            presentation: Presentation::default(),
+        }
+    }
+
     /// Whether the gateway reads this point at all.
     pub fn is_read(&self) -> bool {
         self.poll != Poll::Never

@@ -4,9 +4,9 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::engine::address::Table as RegisterTable;
-use crate::engine::device::{Forbidden, Limits, Wire};
+use crate::engine::device::{Forbidden, Limits, Point, Wire};
 use crate::engine::settings::Parity;
-use crate::engine::test_device::{device_of, point};
+use crate::engine::test_device::device_of;
 
 const LINE: Line = Line { baud: 19200, parity: Parity::Even, stop_bits: 1 };
 
@@ -25,7 +25,7 @@ fn device(places: &[(u16, u16)], change: impl FnOnce(&mut Wire)) -> Device {
         .enumerate()
         .map(|(index, (first, count))| {
             let span = Span::with_count(RegisterTable::Input, *first, *count).expect("a span");
-            point(&format!("p{index}"), Address { span, bits: None }, Poll::Fast)
+            Point::new(&format!("p{index}"), Address { span, bits: None }, Poll::Fast)
         })
         .collect();
     let mut device = device_of(points);

@@ -2,8 +2,7 @@
 
 use busker::engine::address::{Address, Bits, Span, Table};
 use busker::engine::device::{
-    Case, Decimals, Device, Encoding, Form, Identify, Intervals, Kind, Limits, Names, Point, Poll,
-    Presentation, Quirks, Unit, Wire, Write, WriteRule,
+    Case, Decimals, Device, Encoding, Form, Identify, Kind, Names, Point, Poll, Unit, Write, WriteRule,
 };
 use busker::engine::settings::{
     Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password, Settings,
@@ -176,22 +175,10 @@ fn flag(name: &str, at: Address, poll: Poll) -> Point {
     formed(point(name, at, poll), Form::new(Kind::Bool))
 }
 
+/// A number, of 32 bits where it has two registers.
 fn point(name: &str, at: Address, poll: Poll) -> Point {
-    let kind = if at.span.count() == 2 { Kind::U32 } else { Kind::U16 };
-    Point {
-        name: name.into(),
-        at,
-        also: None,
-        encoding: Encoding::Plain(Form::new(kind)),
-        poll,
-        write: None,
-        persistent: false,
-        read_clears: false,
-        default: None,
-        re_read: Vec::new(),
-        deadband: None,
-        presentation: Presentation::default(),
-    }
+    let point = Point::new(name, at, poll);
+    if at.span.count() == 2 { formed(point, Form::new(Kind::U32)) } else { point }
 }
 
 fn with(points: Vec<Point>) -> Device {
@@ -200,17 +187,7 @@ fn with(points: Vec<Point>) -> Device {
         manufacturer: "Test".into(),
         model: "T1".into(),
         source: "a transcript".into(),
-        identify: None,
-        wire: Wire {
-            limits: Limits::default(),
-            readable: Vec::new(),
-            forbidden: Vec::new(),
-            intervals: Intervals { fast: Duration::from_secs(1), slow: Duration::from_secs(30) },
-            response_timeout: None,
-            quirks: Quirks::default(),
-            watchdog: None,
-        },
         points,
-        left_out: Vec::new(),
+        ..Device::default()
     }
 }

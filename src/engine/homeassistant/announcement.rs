@@ -204,9 +204,9 @@ fn without_empty(mut value: Value) -> Value {
 mod tests {
     use super::*;
     use crate::engine::address::{Address, Span, Table};
-    use crate::engine::device::{Case, Encoding, Form, Kind, Poll, Unit, Write, WriteRule};
+    use crate::engine::device::{Case, Encoding, Form, Kind, Point, Poll, Unit, Write, WriteRule};
     use crate::engine::homeassistant::{announce_bridge, announce_bus};
-    use crate::engine::test_device::{device_of, point};
+    use crate::engine::test_device::device_of;
 
     fn gateway() -> Gateway {
         Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into() }
@@ -215,11 +215,11 @@ mod tests {
     /// A relay, and an input that is °C or V as its mode (0, 1, 2: none) says.
     fn device() -> DeviceSettings {
         let at = |table, first| Address { span: Span::single(table, first), bits: None };
-        let mut relay = point("relay", at(Table::Coil, 0), Poll::Fast);
+        let mut relay = Point::new("relay", at(Table::Coil, 0), Poll::Fast);
         relay.write = Some(Write { at: relay.at, with: None, rule: WriteRule::Any });
         relay.presentation.name = Some("Heating relay".into());
-        let mode = point("mode", at(Table::Holding, 0), Poll::Slow);
-        let mut input = point("input", at(Table::Input, 0), Poll::Fast);
+        let mode = Point::new("mode", at(Table::Holding, 0), Poll::Slow);
+        let mut input = Point::new("input", at(Table::Input, 0), Poll::Fast);
         let form = |unit: &str| Some(Form { unit: Unit::Fixed(unit.into()), ..Form::new(Kind::I16) });
         let case = |key, name: &str, form| Case { key, name: name.into(), form };
         input.encoding = Encoding::Cases {

@@ -325,13 +325,13 @@ mod tests {
     use super::*;
     use crate::engine::address::{Address, Span, Table};
     use crate::engine::device::{Decimals, Form, Unit, Write};
-    use crate::engine::test_device::{device_of, point};
+    use crate::engine::test_device::device_of;
 
     /// A point at `holding 0` (or `coil 0` for a flag), read slowly, as `change` makes it.
     fn point_with(form: Form, rule: Option<WriteRule>, change: impl FnOnce(&mut Point)) -> Point {
         let table = if form.kind == Kind::Bool { Table::Coil } else { Table::Holding };
         let at = Address { span: Span::single(table, 0), bits: None };
-        let mut point = point("flow_value", at, Poll::Slow);
+        let mut point = Point::new("flow_value", at, Poll::Slow);
         point.encoding = Encoding::Plain(form);
         point.write = rule.map(|rule| Write { at, with: None, rule });
         change(&mut point);

@@ -203,15 +203,7 @@ impl Resolution<'_, '_> {
     }
 
     fn wire(&mut self) -> device::Wire {
-        let mut resolved = device::Wire {
-            limits: device::Limits::default(),
-            readable: Vec::new(),
-            forbidden: Vec::new(),
-            intervals: device::Intervals::default(),
-            response_timeout: None,
-            quirks: Quirks::default(),
-            watchdog: None,
-        };
+        let mut resolved = device::Wire::default();
         let Some(wire) = &self.profile.wire else { return resolved };
         if let Some(limits) = &wire.limits {
             let of =
