@@ -24,8 +24,11 @@ HERE = pathlib.Path(__file__).parent
 BUSKER = sys.argv[1]
 PATIENCE = 30  # seconds until something that must happen has failed
 
-# What Home Assistant says itself when its broker is stopped.
-BROKER_WAS_LOST = "mqtt.client: Error returned from MQTT server: The connection was lost."
+# What Home Assistant and its MQTT client may say themselves when their broker is stopped.
+BROKER_WAS_LOST = (
+    "mqtt.client: Error returned from MQTT server: The connection was lost.",
+    "paho.mqtt.client: failed to receive on socket: [Errno 104] Connection reset by peer",
+)
 
 # name in the configuration, profile, unit
 DEVICES = [
