@@ -90,7 +90,8 @@ impl Receiver {
     }
 
     pub fn push(&mut self, now: Time, bytes: &[u8]) {
-        // The manual of the FuehlerSysteme devices says it plainly: a pause of 3.5 characters resets.
+        // The silence is looked for only when nothing more is there to be read: a thread that was kept
+        // waiting reads the halves of a frame far apart, however close together they came.
         self.bytes.extend(bytes);
         self.last_byte_at = now;
         if self.framing == Framing::Rtu && self.bytes.len() > BYTES_MAX {

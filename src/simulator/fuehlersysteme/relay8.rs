@@ -415,6 +415,11 @@ impl SimulatedDevice for Relay8 {
             cycle: take_words(words),
             master: take_words(words),
         };
+        // Somebody may have edited the file: what no write could have left is brought into range.
+        for (off, on) in self.settings.off.iter_mut().zip(&mut self.settings.on) {
+            *on = (*on).clamp(-9998, 9999);
+            *off = (*off).clamp(-9999, *on - 1);
+        }
         self.restart(now);
         Ok(())
     }
