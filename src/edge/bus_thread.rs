@@ -273,3 +273,7 @@ impl BusThread {
         self.handle(Event::LinkDown(reason));
     }
 }
+
+#[cfg(test)]
+#[path = "bus_thread_tests.rs"]
+mod tests;
