@@ -162,12 +162,14 @@ record! {
         offset: Option<At<Decimal>>,
         /// Digits behind the dot of what the register holds, or the point that says how many.
         decimals: Option<At<Digits>>,
-        /// The unit, as Home Assistant spells it.
+        /// The unit, as Home Assistant spells it. Beside a shared `is`: instead of each `unit_by` there.
         unit: Option<At<String>>,
         /// The point whose named value is the unit.
         unit_by: Option<At<PointPath>>,
         /// Names of register values, or a shared file.
         values: Option<At<Values>>,
+        /// Names of the shared file that this device does not have.
+        without: Vec<At<String>> = Vec::new(),
         /// Register values that mean "no reading", with the reason.
         invalid: Map<i128, String> = Map::default(),
         /// The measuring range, in the unit (temperatures in °C).

@@ -70,6 +70,7 @@ impl Resolution<'_, '_> {
     }
 
     fn form(&mut self, expanded: &Expanded<'_>, form: &Form) -> device::Form {
+        self.names_left_out_are_there(form);
         let names = self.names(expanded, form);
         let kind = kind_of(expanded, form, &names);
         let mut resolved = device::Form::new(kind);
@@ -84,10 +85,11 @@ impl Resolution<'_, '_> {
                 self.lookup(&path, Some(expanded)).map(Decimals::By)
             }
         };
-        resolved.unit = match (&form.unit, &form.unit_by) {
-            (Some(unit), _) => Unit::Fixed(unit.value.clone()),
-            (None, Some(path)) => self.lookup(path, Some(expanded)).map_or(Unit::None, Unit::By),
-            (None, None) => Unit::None,
+        // The point's own unit stands where a shared case leaves it to a point that this device has not.
+        resolved.unit = match (&form.unit, &form.unit_by, &expanded.file.form.unit) {
+            (Some(unit), _, _) | (None, Some(_), Some(unit)) => Unit::Fixed(unit.value.clone()),
+            (None, Some(path), None) => self.lookup(path, Some(expanded)).map_or(Unit::None, Unit::By),
+            (None, None, _) => Unit::None,
         };
         resolved.difference = expanded.file.difference;
         resolved.names = match names {
@@ -119,9 +121,27 @@ impl Resolution<'_, '_> {
                 .shared
                 .get(file)
                 .map(|cases| {
-                    cases.iter().map(|(value, case)| (value.value, case.name.value.clone())).collect()
+                    cases
+                        .iter()
+                        .map(|(value, case)| (value.value, case.name.value.clone()))
+                        .filter(|(_, name)| !form.without.iter().any(|without| without.value == *name))
+                        .collect()
                 })
                 .unwrap_or_default(),
+        }
+    }
+
+    fn names_left_out_are_there(&mut self, form: &Form) {
+        let Some(At { value: Values::Shared(file), .. }) = &form.values else { return };
+        let Some(cases) = self.shared.get(file) else { return };
+        let known: Vec<&str> = cases.iter().map(|(_, case)| case.name.value.as_str()).collect();
+        for without in form.without.iter().filter(|without| !known.contains(&without.value.as_str())) {
+            let message = format!(
+                "`{}` is no name of `{file}`; {}",
+                without.value,
+                list_of_choices(&without.value, &known)
+            );
+            self.faults.add(&without.place, message);
         }
     }
 
@@ -176,6 +196,14 @@ impl Resolution<'_, '_> {
             Cases::Shared(file) => {
                 let shared = self.shared;
                 let Some(listed) = shared.get(file) else { return unknown };
+                if let Some(unit) = &expanded.file.form.unit {
+                    if !listed.iter().any(|(_, case)| case.form.unit_by.is_some()) {
+                        self.faults.add(
+                            &unit.place,
+                            format!("`unit` beside `{file}`, where no case has a `unit_by` that it could replace; remove it"),
+                        );
+                    }
+                }
                 for (key, name) in &names {
                     match listed.get(key).filter(|case| case.name.value == *name) {
                         Some(case) => {

@@ -15,6 +15,7 @@ impl Rules<'_, '_> {
         self.texts_have_no_scale_or_unit();
         self.flags_have_no_scale_or_unit();
         self.scales_and_units_are_said_once();
+        self.only_shared_names_are_left_out();
         self.names_of_values_are_unique();
         self.named_and_invalid_values_are_possible();
         self.what_decides_is_read();
@@ -31,8 +32,13 @@ impl Rules<'_, '_> {
                 (None, Some(cases)) => self
                     .faults
                     .add(&cases.place, "`is` without `by`; expected the point that decides, as in `by: mode`"),
-                (Some(_), Some(_)) => {
-                    for (key, place) in said(&file.form) {
+                (Some(_), Some(cases)) => {
+                    let mut keys = said(&file.form);
+                    if let Cases::Shared(_) = cases.value {
+                        // It replaces the `unit_by` of the shared cases.
+                        keys.retain(|(key, _)| *key != "unit");
+                    }
+                    for (key, place) in keys {
                         self.faults.add(
                             place,
                             format!("`{key}` beside `is`, whose cases say it; expected it in the cases only"),
@@ -113,6 +119,25 @@ impl Rules<'_, '_> {
                 }
                 if let (Some(_), Some(unit_by)) = (&form.unit, &form.unit_by) {
                     self.faults.add(&unit_by.place, "`unit_by` beside `unit`; expected one of them");
+                }
+            }
+        }
+    }
+
+    fn only_shared_names_are_left_out(&mut self) {
+        for Subject { file, .. } in self.entries() {
+            for form in forms_of(file) {
+                let Some(without) = form.without.first() else { continue };
+                if !matches!(form.values, Some(At { value: Values::Shared(_), .. })) {
+                    let expected = if file.is.is_some() {
+                        "it at the point that decides, beside the `values` there"
+                    } else {
+                        "such a file beside it, as in `values: shared/measuring`"
+                    };
+                    self.faults.add(
+                        &without.place,
+                        format!("`without` leaves out names of a shared file; expected {expected}"),
+                    );
                 }
             }
         }
