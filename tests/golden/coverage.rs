@@ -101,6 +101,11 @@ const MANUALS: &[(&str, &[Registers])] = &[
         "metz-connect/mr-ci4",
         &[(Table::Input, 0, 3, ALL), (Table::Input, 4, 4, 0x0FFF), (Table::Holding, 65, 65, ALL)],
     ),
+    // BTR, chapters 10.1 and 10.2.
+    (
+        "btr/mr-ai8",
+        &[(Table::Input, 0, 15, ALL), (Table::Holding, 0, 63, ALL), (Table::Holding, 65, 65, ALL)],
+    ),
     // FuehlerSysteme, chapters 6.1.1, 6.1.2 and 7: Rreg are input, RWreg and Wreg holding registers.
     (
         "fuehlersysteme/relay8",
