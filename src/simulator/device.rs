@@ -3,13 +3,16 @@
 use std::fmt;
 
 use crate::engine::time::{Duration, Time};
+use crate::simulator::btr;
 use crate::simulator::fuehlersysteme::relay8::Relay8;
 use crate::simulator::metz_connect::MetzConnect;
 use crate::simulator::metz_connect::mr_ai8::MrAi8;
 use crate::simulator::metz_connect::mr_ao4::{MrAo4, MrAop4};
+use crate::simulator::metz_connect::mr_ci4::MrCi4;
 use crate::simulator::metz_connect::mr_di::{MrDi4, MrDi10};
 use crate::simulator::metz_connect::mr_do4::{MrDo4, MrDoa4};
 use crate::simulator::metz_connect::mr_si4::MrSi4;
+use crate::simulator::metz_connect::mr_to4::MrTo4;
 
 /// A device on a line. It opens nothing, waits for nothing and is told the time; a caller may let
 /// any amount of time pass between two calls, but never lets it run backwards.
@@ -76,6 +79,8 @@ pub enum Stimulus {
     HandVolts { output: u8, volts: Option<f64> },
     /// What is connected to an input.
     Input { input: u8, signal: Signal },
+    /// One of the small switches behind the front.
+    Dip { switch: u8, on: bool },
     /// Somebody presses the button at the device's front.
     Button,
 }
@@ -95,6 +100,7 @@ pub enum Signal {
     Open,
     Ohms(f64),
     Volts(f64),
+    Milliamps(f64),
     /// The temperature at a sensor of the kind that the input is configured for.
     Celsius(f64),
     /// A contact, closed or open.
@@ -162,11 +168,14 @@ pub enum Model {
     MrDoa4,
     MrAo4,
     MrAop4,
+    MrCi4,
+    MrTo4,
+    BtrMrAi8,
     Relay8,
 }
 
 impl Model {
-    pub const ALL: [Model; 9] = [
+    pub const ALL: [Model; 12] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,
@@ -175,6 +184,9 @@ impl Model {
         Model::MrDoa4,
         Model::MrAo4,
         Model::MrAop4,
+        Model::MrCi4,
+        Model::MrTo4,
+        Model::BtrMrAi8,
         Model::Relay8,
     ];
 
@@ -189,6 +201,9 @@ impl Model {
             Model::MrDoa4 => "metz-connect/mr-doa4",
             Model::MrAo4 => "metz-connect/mr-ao4",
             Model::MrAop4 => "metz-connect/mr-aop4",
+            Model::MrCi4 => "metz-connect/mr-ci4",
+            Model::MrTo4 => "metz-connect/mr-to4",
+            Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
         }
     }
@@ -208,6 +223,9 @@ impl Model {
             Model::MrDoa4 => Box::new(MetzConnect::new(now, line, MrDoa4::new(now))),
             Model::MrAo4 => Box::new(MetzConnect::new(now, line, MrAo4::new(now))),
             Model::MrAop4 => Box::new(MetzConnect::new(now, line, MrAop4::new(now))),
+            Model::MrCi4 => Box::new(MetzConnect::new(now, line, MrCi4::new(now))),
+            Model::MrTo4 => Box::new(MetzConnect::new(now, line, MrTo4::new(now))),
+            Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
         }
     }

@@ -4,11 +4,12 @@
 //! profile and shares nothing with the gateway's encoder and line guard.
 //!
 //! From the inside out: [`pdu`] takes requests apart; [`device`] is what every device can do;
-//! [`metz_connect`] and [`fuehlersysteme`] are the devices; [`wire`] is their framing; [`line`] puts
+//! [`metz_connect`], [`btr`] and [`fuehlersysteme`] are the devices; [`wire`] is their framing; [`line`] puts
 //! several on one line, with [`fault`]s on request; [`script`] is the words in which a person or a
 //! file changes the process side; [`server`] serves all of it on pseudo-terminals and sockets. Only
 //! `port`, `store` and `server` do anything; everything before them is told the time.
 
+pub mod btr;
 pub mod device;
 pub mod fault;
 pub mod fuehlersysteme;

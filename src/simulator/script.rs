@@ -30,12 +30,16 @@ pub struct Step {
 
 /// The commands, as the help shows them.
 pub const COMMANDS: &str = "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4)
+  unit N triac T hand on|off|automatic      a triac's hand switch (MR-TO4)
   unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
   unit N input I ohms X | volts X | celsius X | open
                                             what is connected to an input (MR-AI8)
+  unit N input I volts X | milliamps X | open
+                                            what is connected to an input (MR-CI4)
   unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
+  unit N dip D on|off                       a DIP switch (MR-CI4)
   unit N button                             somebody presses the button (MR-SI4)
   unit N power off|on                       power loss: only the EEPROM is kept
   unit N restart                            the same, and silent for two seconds
@@ -91,7 +95,7 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
             return Ok(Action::Fault(Fault { unit: Some(unit), ..fault }));
         }
         ["button"] => Stimulus::Button,
-        ["relay", relay, "hand", position] => {
+        ["relay" | "triac", relay, "hand", position] => {
             let position = match *position {
                 "automatic" => Hand::Automatic,
                 "on" => Hand::On,
@@ -103,6 +107,9 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
                 }
             };
             Stimulus::Hand { relay: parse_number("relay", relay)?, position }
+        }
+        ["dip", switch, state @ ("on" | "off")] => {
+            Stimulus::Dip { switch: parse_number("switch", switch)?, on: *state == "on" }
         }
         ["output", output, "hand", setting] => {
             let volts = if *setting == "automatic" { None } else { Some(parse_finite(setting)?) };
@@ -123,6 +130,7 @@ fn parse_signal(words: &[&str]) -> Result<Signal, String> {
         ["contact", "closed"] => Ok(Signal::Contact(true)),
         ["ohms", number] => Ok(Signal::Ohms(parse_finite(number)?)),
         ["volts", number] => Ok(Signal::Volts(parse_finite(number)?)),
+        ["milliamps", number] => Ok(Signal::Milliamps(parse_finite(number)?)),
         ["celsius", number] => Ok(Signal::Celsius(parse_finite(number)?)),
         ["counter", number] => Ok(Signal::Counter(parse_number("count", number)?)),
         ["pulses", number] => {

@@ -3,13 +3,16 @@
 //!
 //! [`MetzConnect`] is that common part around a [`Module`], which is one device's own chapter.
 
-mod channel;
-mod holding;
+pub(super) mod analog_inputs;
+pub(super) mod channel;
+pub(super) mod holding;
 pub mod mr_ai8;
 pub mod mr_ao4;
+pub mod mr_ci4;
 pub mod mr_di;
 pub mod mr_do4;
 pub mod mr_si4;
+pub mod mr_to4;
 mod sensors;
 mod switches;
 mod watchdog;
@@ -22,10 +25,13 @@ use crate::simulator::pdu::{Exception, Request, exception_reply, write_reply};
 
 /// The chapter of one device: its registers, its process side, its EEPROM.
 pub trait Module: Send {
+    const VENDOR: &'static str = "METZ CONNECT GmbH";
     const PRODUCT: &'static str;
     const VERSION: &'static str;
     /// Its function codes, besides 8 and 43 which all of them have.
     const FUNCTIONS: &'static [u8];
+    /// Those that write register 65.
+    const LINE_FUNCTIONS: &'static [u8] = &[6, 16];
 
     /// Answers a request with one of `FUNCTIONS`, for anything but register 65.
     fn serve(&mut self, now: Time, request: &Request) -> Result<Vec<u8>, Exception>;
@@ -68,7 +74,6 @@ const LINE_REGISTER: u16 = 65;
 const LINE_MAGIC: u8 = 0x53;
 const BAUD_RATES: [u32; 8] = [1200, 2400, 4800, 9600, 19200, 38400, 57600, 115_200];
 const PARITIES: [Parity; 3] = [Parity::Even, Parity::Odd, Parity::None];
-const VENDOR: &str = "METZ CONNECT GmbH";
 
 impl<M: Module> MetzConnect<M> {
     pub fn new(_now: Time, line: LineSettings, module: M) -> MetzConnect<M> {
@@ -89,7 +94,9 @@ impl<M: Module> MetzConnect<M> {
                 self.set_line(*word)?;
                 Ok(Some(write_reply(function, LINE_REGISTER, *word)))
             }
-            Request::WriteRegisters { first: LINE_REGISTER, words } if words.len() == 1 => {
+            Request::WriteRegisters { first: LINE_REGISTER, words }
+                if words.len() == 1 && M::LINE_FUNCTIONS.contains(&function) =>
+            {
                 self.set_line(words[0])?;
                 Ok(Some(write_reply(function, LINE_REGISTER, 1)))
             }
@@ -162,7 +169,7 @@ fn identify<M: Module>(interface: u8, data: &[u8]) -> Result<Vec<u8>, Exception>
     if *code != 1 {
         return Err(Exception::Value);
     }
-    let objects = [VENDOR, M::PRODUCT, M::VERSION];
+    let objects = [M::VENDOR, M::PRODUCT, M::VERSION];
     // The specification (6.21): an unknown first object begins at the start again.
     let first = if usize::from(*object) < objects.len() { usize::from(*object) } else { 0 };
     let mut reply = vec![43, 14, 1, 1, 0, 0, (objects.len() - first) as u8];
@@ -257,26 +264,25 @@ mod tests {
 
     #[test]
     fn identification_gives_vendor_product_and_version_in_one_reply() {
-        for (model, product) in [
-            (Model::MrDo4, "MR-DO4 V1.4"),
-            (Model::MrSi4, "MR-SI4 V2.1"),
-            (Model::MrAi8, "MR-AI8 V1.8"),
-            (Model::MrDi4, "MR-DI4 V1.4"),
-            (Model::MrDi10, "MR-DI10 V1.4"),
-            (Model::MrDoa4, "MR-DO4 V1.4"),
-            (Model::MrAo4, "MR-AO4 V1.4"),
-            (Model::MrAop4, "MR-AOP4 V1.5"),
+        let metz_connect = "METZ CONNECT GmbH";
+        for (model, vendor, product, version) in [
+            (Model::MrDo4, metz_connect, "MR-DO4", "V1.4"),
+            (Model::MrSi4, metz_connect, "MR-SI4", "V2.1"),
+            (Model::MrAi8, metz_connect, "MR-AI8", "V1.8"),
+            (Model::MrDi4, metz_connect, "MR-DI4", "V1.4"),
+            (Model::MrDi10, metz_connect, "MR-DI10", "V1.4"),
+            (Model::MrDoa4, metz_connect, "MR-DO4", "V1.4"),
+            (Model::MrAo4, metz_connect, "MR-AO4", "V1.4"),
+            (Model::MrAop4, metz_connect, "MR-AOP4", "V1.5"),
+            (Model::MrTo4, metz_connect, "MR-TO4", "V1.5"),
+            (Model::MrCi4, metz_connect, "MR-CI4", "V1.4"),
+            (Model::BtrMrAi8, "BTR", "MR-AI8", "V1.0"),
         ] {
-            let (name, version) = product.split_once(' ').expect("a name and a version");
             let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();
             let mut bench = Bench::new(model);
-            let reply = format!(
-                "2B0E01010000030011{}01{:02X}{}0204{}",
-                hex("METZ CONNECT GmbH"),
-                name.len(),
-                hex(name),
-                hex(version)
-            );
+            let object = |text: &str| format!("{:02X}{}", text.len(), hex(text));
+            let reply =
+                format!("2B0E0101000003 00{} 01{} 02{}", object(vendor), object(product), object(version));
             bench.check(&[
                 ("2B 0E 01 00", &reply),
                 ("2B 0E 01 07", &reply),

@@ -1,139 +1,86 @@
 //! MR-AI8: eight inputs for voltage, resistance and temperature (Softwarebeschreibung Modbus RTU
 //! V2.1, chapter MR-AI8, pages 48 to 58).
 
-use crate::engine::time::{Duration, Time};
-use crate::simulator::device::{Signal, Stimulus, take_words};
+use crate::engine::time::Time;
+use crate::simulator::device::{Stimulus, take_words};
 use crate::simulator::metz_connect::Module;
-use crate::simulator::metz_connect::channel::{Code, Format, is_above, measure, raw_words};
+use crate::simulator::metz_connect::analog_inputs::{AnalogInputs, INPUTS, REGISTERS, check_codes};
+use crate::simulator::metz_connect::channel::{Code, is_above};
+use crate::simulator::metz_connect::holding::HoldingRegisters;
 use crate::simulator::pdu::{Exception, Request, bits_reply, check_span, words_reply, write_reply};
 
 /// The eight inputs.
 pub struct MrAi8 {
-    /// Registers 0 to 15. Of all settings only these are not marked as EEPROM: a restart clears them.
-    offsets: [u16; 2 * INPUTS],
-    eeprom: Eeprom,
-    inputs: [Input; INPUTS],
-}
-
-#[derive(Clone, Debug)]
-struct Eeprom {
-    /// Registers 16 to 23.
-    codes: [u16; INPUTS],
-    /// Registers 24 to 63: temperature and resistance of ten points, each a float.
-    table: [u16; TABLE_WORDS],
-    /// Register 68, and coil 0.
+    inputs: AnalogInputs,
+    /// Register 68, and coil 0. EEPROM.
     fahrenheit: bool,
-    /// Registers 70 to 101: on and off, two registers each, for each input.
+    /// Registers 70 to 101: on and off, two registers each, for each input. EEPROM.
     thresholds: [u16; 4 * INPUTS],
+    /// Whether each value has passed its switch-on threshold and not fallen below the other.
+    above: [bool; INPUTS],
 }
 
-#[derive(Clone, Copy, Debug)]
-struct Input {
-    signal: Signal,
-    /// When the first measurement after a start or a new configuration is ready.
-    ready_at: Time,
-    /// The two registers of the measured value.
-    words: [u16; 2],
-    /// Whether the value has passed its switch-on threshold and not fallen below the other.
-    above: bool,
-}
-
-const INPUTS: usize = 8;
-const TABLE_WORDS: usize = 40;
-/// "Solange noch keine Messung erfolgt ist, ist der Messwert 0"; the manual names no time for it.
-const FIRST_MEASUREMENT: Duration = Duration::from_millis(250);
-const OFFSETS: (u16, u16) = (0, 15);
-const CODES: (u16, u16) = (16, 23);
-const TABLE: (u16, u16) = (24, 63);
 const UNIT: u16 = 68;
 const THRESHOLDS: (u16, u16) = (70, 101);
 const THRESHOLD_STATES: u16 = 70;
 
 impl MrAi8 {
     pub fn new(now: Time) -> MrAi8 {
-        let eeprom = Eeprom {
-            codes: [0; INPUTS],
-            table: [0; TABLE_WORDS],
+        MrAi8 {
+            inputs: AnalogInputs::new(now),
             fahrenheit: false,
             thresholds: [0; 4 * INPUTS],
-        };
-        let input =
-            Input { signal: Signal::Open, ready_at: now + FIRST_MEASUREMENT, words: [0; 2], above: false };
-        MrAi8 { offsets: [0; 2 * INPUTS], eeprom, inputs: [input; INPUTS] }
-    }
-
-    fn read(&self, register: u16) -> u16 {
-        let at = |first: u16| usize::from(register - first);
-        match register {
-            0..=15 => self.offsets[at(OFFSETS.0)],
-            16..=23 => self.eeprom.codes[at(CODES.0)],
-            24..=63 => self.eeprom.table[at(TABLE.0)],
-            UNIT => self.eeprom.fahrenheit.into(),
-            _ => self.eeprom.thresholds[at(THRESHOLDS.0)],
+            above: [false; INPUTS],
         }
-    }
-
-    /// Writes registers whose addresses have been checked; all of them, or none if a code is refused.
-    fn write(&mut self, now: Time, first: u16, words: &[u16]) -> Result<(), Exception> {
-        let registers = || (first..).zip(words);
-        // Reserved codes have no meaning that could be measured, so they are refused.
-        let is_code = |register: u16| (CODES.0..=CODES.1).contains(&register);
-        if registers().any(|(register, word)| is_code(register) && Code::parse(*word).is_none()) {
-            return Err(Exception::Value);
-        }
-        for (register, word) in registers() {
-            let at = |first: u16| usize::from(register - first);
-            match register {
-                0..=15 => self.offsets[at(OFFSETS.0)] = *word,
-                16..=23 => {
-                    let code = &mut self.eeprom.codes[at(CODES.0)];
-                    // Another circuit or sensor has to measure first; bit 8 only turns the comparison.
-                    if (*code ^ word) & 0xFF != 0 {
-                        self.inputs[at(CODES.0)].ready_at = now + FIRST_MEASUREMENT;
-                    }
-                    *code = *word;
-                }
-                24..=63 => self.eeprom.table[at(TABLE.0)] = *word,
-                UNIT => self.eeprom.fahrenheit = word & 1 == 1,
-                _ => self.eeprom.thresholds[at(THRESHOLDS.0)] = *word,
-            }
-        }
-        self.measure(now);
-        Ok(())
     }
 
     /// Measures all inputs, and compares them with their thresholds.
     fn measure(&mut self, now: Time) {
-        let eeprom = &self.eeprom;
-        for (number, input) in self.inputs.iter_mut().enumerate() {
-            // Only allowed codes are ever written.
-            let code = Code::parse(eeprom.codes[number]).unwrap_or_default();
-            let offset = [self.offsets[2 * number], self.offsets[2 * number + 1]];
-            input.words = if now < input.ready_at {
-                [0; 2]
-            } else {
-                raw_words(code, measure(code, input.signal, &eeprom.table, eeprom.fahrenheit), offset)
-            };
-            let [on_high, on_low, off_high, off_low] = take_words(&mut &eeprom.thresholds[4 * number..]);
-            input.above =
-                is_above(code.format, input.words, [on_high, on_low], [off_high, off_low], input.above);
+        self.inputs.measure(now, self.fahrenheit);
+        for (number, above) in self.above.iter_mut().enumerate() {
+            let (format, value) = (self.inputs.code(number).format, self.inputs.value(number));
+            let [on_high, on_low, off_high, off_low] = take_words(&mut &self.thresholds[4 * number..]);
+            *above = is_above(format, value, [on_high, on_low], [off_high, off_low], *above);
         }
     }
 
     /// Discrete inputs 0 to 7: bit 8 of the code turns each over.
     fn threshold_states(&self) -> [bool; INPUTS] {
-        std::array::from_fn(|number| self.inputs[number].above != (self.eeprom.codes[number] >> 8 & 1 == 1))
+        std::array::from_fn(|number| self.above[number] != (self.inputs.raw_code(number) >> 8 & 1 == 1))
     }
 }
 
-/// Holding registers 0 to 63, 68 and 70 to 101 (page 50).
-fn check_holding(first: u16, count: usize) -> Result<(), Exception> {
-    let allowed = match first {
-        UNIT => (UNIT, UNIT),
-        70.. => THRESHOLDS,
-        _ => (OFFSETS.0, TABLE.1),
-    };
-    check_span(first, count, 125, allowed)
+impl HoldingRegisters for MrAi8 {
+    /// Holding registers 0 to 63, 68 and 70 to 101 (page 50).
+    fn check(first: u16, count: usize) -> Result<(), Exception> {
+        let allowed = match first {
+            UNIT => (UNIT, UNIT),
+            70.. => THRESHOLDS,
+            _ => REGISTERS,
+        };
+        check_span(first, count, 125, allowed)
+    }
+
+    fn read(&self, register: u16) -> u16 {
+        match register {
+            UNIT => self.fahrenheit.into(),
+            70.. => self.thresholds[usize::from(register - THRESHOLDS.0)],
+            _ => self.inputs.read(register),
+        }
+    }
+
+    fn write(&mut self, now: Time, first: u16, words: &[u16]) -> Result<(), Exception> {
+        check_codes(first, words, |word| Code::parse(word).is_some())?;
+        for (register, word) in (first..).zip(words) {
+            match register {
+                UNIT => self.fahrenheit = word & 1 == 1,
+                70.. => self.thresholds[usize::from(register - THRESHOLDS.0)] = *word,
+                _ => self.inputs.write(now, register, *word),
+            }
+        }
+        self.measure(now);
+        Ok(())
+    }
 }
 
 impl Module for MrAi8 {
@@ -145,7 +92,7 @@ impl Module for MrAi8 {
         match *request {
             Request::Read { function: 1, first, count } => {
                 check_span(first, count.into(), 1, (0, 0))?;
-                Ok(bits_reply(1, &[self.eeprom.fahrenheit]))
+                Ok(bits_reply(1, &[self.fahrenheit]))
             }
             Request::Read { function: 2, first, count } => {
                 // The page speaks of "2 x Anzahl der Register" bytes: the words of function 4, put
@@ -160,16 +107,7 @@ impl Module for MrAi8 {
                 let bits = states.iter().enumerate().map(|(number, on)| u16::from(*on) << number).sum();
                 Ok(words_reply(4, &[bits]))
             }
-            Request::Read { function: 4, first, count } => {
-                check_span(first, count.into(), 2 * INPUTS, (0, 15))?;
-                let words: Vec<u16> = self.inputs.iter().flat_map(|input| input.words).collect();
-                Ok(words_reply(4, &words[usize::from(first)..usize::from(first + count)]))
-            }
-            Request::Read { function, first, count } => {
-                check_holding(first, count.into())?;
-                let words: Vec<u16> = (first..first + count).map(|register| self.read(register)).collect();
-                Ok(words_reply(function, &words))
-            }
+            Request::Read { function: 4, first, count } => self.inputs.read_values(first, count),
             Request::WriteCoil { address, value } => {
                 if value != 0 && value != 0xFF00 {
                     return Err(Exception::Value);
@@ -178,17 +116,7 @@ impl Module for MrAi8 {
                 self.write(now, UNIT, &[u16::from(value != 0)])?;
                 Ok(write_reply(5, address, value))
             }
-            Request::WriteRegister { address, word } => {
-                check_holding(address, 1)?;
-                self.write(now, address, &[word])?;
-                Ok(write_reply(6, address, word))
-            }
-            Request::WriteRegisters { first, ref words } => {
-                check_holding(first, words.len())?;
-                self.write(now, first, words)?;
-                Ok(write_reply(16, first, words.len() as u16))
-            }
-            _ => Err(Exception::Function),
+            _ => self.serve_holding(now, request),
         }
     }
 
@@ -197,61 +125,37 @@ impl Module for MrAi8 {
     }
 
     fn restart(&mut self, now: Time) {
-        self.offsets = [0; 2 * INPUTS];
-        for input in &mut self.inputs {
-            input.ready_at = now + FIRST_MEASUREMENT;
-            input.above = false;
-        }
+        self.inputs.restart(now);
+        self.above = [false; INPUTS];
         self.measure(now);
     }
 
     fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String> {
-        match *stimulus {
-            Stimulus::Input { input: number @ 1..=8, signal } => {
-                if !matches!(signal, Signal::Open | Signal::Ohms(_) | Signal::Volts(_) | Signal::Celsius(_)) {
-                    return Err("an input of MR-AI8 takes ohms, volts, celsius or open".into());
-                }
-                self.inputs[usize::from(number) - 1].signal = signal;
-                self.measure(now);
-                Ok(())
-            }
-            Stimulus::Input { input, .. } => Err(format!("input {input} is not there; MR-AI8 has 1 to 8")),
-            _ => Err("MR-AI8 has inputs and nothing else to touch".into()),
-        }
+        self.inputs.stimulate(stimulus)?;
+        self.measure(now);
+        Ok(())
     }
 
     fn outputs(&self) -> Vec<(String, String)> {
-        let inputs = self.inputs.iter().zip(self.eeprom.codes).enumerate();
-        let values = inputs.map(|(number, (input, code))| {
-            let text = match Code::parse(code).unwrap_or_default().format {
-                Format::Float => {
-                    f32::from_bits(u32::from(input.words[0]) << 16 | u32::from(input.words[1])).to_string()
-                }
-                Format::Integer { .. } => (input.words[0] as i16).to_string(),
-            };
-            (format!("input_{}", number + 1), text)
-        });
         let states = self.threshold_states().into_iter().enumerate();
         let states = states.map(|(number, on)| {
             (format!("threshold_{}", number + 1), if on { "ON" } else { "OFF" }.to_string())
         });
-        values.chain(states).collect()
+        self.inputs.outputs().into_iter().chain(states).collect()
     }
 
     fn eeprom(&self) -> Vec<u16> {
-        let mut words = self.eeprom.codes.to_vec();
-        words.extend(self.eeprom.table);
-        words.push(self.eeprom.fahrenheit.into());
-        words.extend(self.eeprom.thresholds);
+        let mut words = self.inputs.eeprom();
+        words.push(self.fahrenheit.into());
+        words.extend(self.thresholds);
         words
     }
 
     fn load_eeprom(&mut self, mut words: &[u16]) {
         let words = &mut words;
-        self.eeprom.codes = take_words(words);
-        self.eeprom.table = take_words(words);
-        self.eeprom.fahrenheit = take_words::<1>(words) == [1];
-        self.eeprom.thresholds = take_words(words);
+        self.inputs.load_eeprom(words);
+        self.fahrenheit = take_words::<1>(words) == [1];
+        self.thresholds = take_words(words);
     }
 }
 
