@@ -71,7 +71,8 @@ impl App {
         let route = Route::new(&settings, topics.clone(), buses.clone(), mailbox.clone());
         let broker = Broker::start(&settings, password, clock, mailbox.clone(), move |news| route.tell(news));
         let first = (0..buses.len()).map(|index| Bus::new(clock.now(), &settings, index).report(clock.now()));
-        let reporter = Arc::new(Reporter::new(broker.state(), questions(&buses), first.collect()));
+        let state = broker.state();
+        let reporter = Arc::new(Reporter::new(move || state.report(), questions(&buses), first.collect()));
         let http = listener.map(|listener| Http::serve(listener, reporter.clone(), clock));
         let watch = tokio::spawn(watch(reporter.clone(), topics, mailbox));
         Ok(App { runtime, buses, broker, http, reporter, watch })

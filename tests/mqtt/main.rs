@@ -5,6 +5,7 @@ mod rig;
 use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixDatagram;
 use std::process::Command;
 
 use busker::engine::time::Duration;
@@ -367,17 +368,14 @@ fn http_tells_how_everything_is() {
     gateway.wait_for_health(503);
 }
 
+/// `mosquitto_passwd` on `busker` and `open sesame`.
+const HASH: &str = "busker:$7$101$BtdmltEzcLwk8OSY$\
+E/hZue7W5k918I4FS8G53PMCS/qjssXbAFlKHAqCMycxZVLVqN+w0FWxALcZUZnXHN79lYWz/wzftKwo29BOUQ==\n";
+
 #[test]
 fn a_broker_that_wants_a_password_gets_it_and_no_log_does() {
     let folder = tempfile::tempdir().expect("a folder");
-    let hashes = folder.path().join("hashes");
-    let made = Command::new("mosquitto_passwd")
-        .args(["-c", "-b"])
-        .arg(&hashes)
-        .args(["busker", "open sesame"])
-        .status()
-        .expect("mosquitto_passwd is installed with mosquitto");
-    assert!(made.success());
+    let hashes = rig::temporary_file(&folder, "hashes", HASH);
     // A mosquitto that is started by root reads it as another user.
     fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).expect("the folder can be opened");
     fs::set_permissions(&hashes, fs::Permissions::from_mode(0o644)).expect("the file can be opened");
@@ -404,6 +402,35 @@ fn a_broker_that_wants_a_password_gets_it_and_no_log_does() {
     wait_until_all_is_online(&watcher);
     assert!(!gateway.log().join("\n").contains("sesame"), "{:?}", gateway.log());
     assert!(watcher.received().iter().all(|got| !got.payload.contains("sesame")));
+}
+
+#[test]
+fn systemd_is_told_of_start_life_and_end_and_the_journal_stamps_the_lines() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("notify");
+    let socket = UnixDatagram::bind(&path).expect("a socket");
+    socket.set_read_timeout(Some(Duration::from_secs(20))).expect("the time is positive");
+    let next = || {
+        let mut bytes = [0; 256];
+        let length = socket.recv(&mut bytes).expect("systemd is told something");
+        String::from_utf8_lossy(&bytes[..length]).trim_end().to_string()
+    };
+    let path = path.to_str().expect("the path is text");
+    let gateway = Gateway::start_in(
+        &[("NOTIFY_SOCKET", path), ("WATCHDOG_USEC", "900000"), ("JOURNAL_STREAM", "8:1")],
+        &format!("mqtt: {{url: 'mqtt://127.0.0.1:{}'}}\n{}", broker.port, configuration(&port)),
+    );
+    // The watchdog may be fed for the first time before all is ready.
+    let mut told: Vec<String> = (0..4).map(|_| next()).collect();
+    assert!(told.contains(&"READY=1".to_string()), "{told:?}");
+    told.retain(|line| line != "READY=1");
+    assert_eq!(told, ["WATCHDOG=1"; 3]);
+    let line = gateway.wait_for_log("HTTP on");
+    assert!(line.trim_start().starts_with("INFO HTTP on"), "`{line}` has a time of its own");
+    assert!(gateway.terminate().success());
+    rig::eventually(|| (next() == "STOPPING=1").then_some(())).expect("the end is told");
 }
 
 #[test]

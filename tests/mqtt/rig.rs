@@ -115,6 +115,11 @@ impl Gateway {
 
     /// `rest` is the configuration without HTTP and the state directory.
     pub fn start_with(rest: &str) -> Gateway {
+        Gateway::start_in(&[], rest)
+    }
+
+    /// The same with more variables in its environment.
+    pub fn start_in(environment: &[(&str, &str)], rest: &str) -> Gateway {
         let folder = tempfile::tempdir().expect("a folder");
         let file = folder.path().join("busker.yaml");
         let text = format!(
@@ -125,6 +130,8 @@ impl Gateway {
         let mut child = Command::new(env!("CARGO_BIN_EXE_busker"))
             .args(["run", "--config"])
             .arg(&file)
+            .env_remove("JOURNAL_STREAM")
+            .envs(environment.iter().copied())
             .stdin(Stdio::null())
             .stderr(Stdio::piped())
             .spawn()
