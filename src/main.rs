@@ -23,12 +23,13 @@ fn tell(failure: &Failure) {
                 eprintln!("  because: {cause}");
             }
         }
-        Failure::Faults(faults) => {
+        Failure::Faults { faults, so } => {
             for fault in faults {
                 eprintln!("{}\n", fault.trim_end());
             }
             let count = faults.len();
-            eprintln!("error: {count} {}, nothing was started", if count == 1 { "fault" } else { "faults" });
+            let consequence = so.map(|so| format!(", {so}")).unwrap_or_default();
+            eprintln!("error: {count} {}{consequence}", if count == 1 { "fault" } else { "faults" });
         }
     }
 }

@@ -70,7 +70,7 @@ pub fn load(path: &Path) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
 
 /// Faults as a verb returns them.
 pub fn faults(faults: Vec<Diagnostic>) -> Failure {
-    Failure::Faults(faults.iter().map(ToString::to_string).collect())
+    Failure::Faults { faults: faults.iter().map(ToString::to_string).collect(), so: None }
 }
 
 /// Puts every `.yaml` file below `folder` into the library, by its path below `root`.

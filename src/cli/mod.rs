@@ -76,8 +76,9 @@ pub enum Failure {
     Failed(anyhow::Error),
     /// What was asked makes no sense: an unknown device, a value out of range.
     WrongInput(anyhow::Error),
-    /// Faults in files, rendered, each beginning with its place.
-    Faults(Vec<String>),
+    /// Faults in files, rendered, each beginning with its place. `so` ends the last line with what
+    /// did not happen for their sake, where something was to happen.
+    Faults { faults: Vec<String>, so: Option<&'static str> },
 }
 
 impl Failure {
@@ -90,10 +91,18 @@ impl Failure {
         Failure::WrongInput(anyhow::anyhow!("{message}"))
     }
 
+    /// The same failure, with what did not happen for the sake of faults.
+    pub fn so(self, what: &'static str) -> Failure {
+        match self {
+            Failure::Faults { faults, .. } => Failure::Faults { faults, so: Some(what) },
+            other => other,
+        }
+    }
+
     pub fn exit_code(&self) -> u8 {
         match self {
             Failure::Failed(_) => 1,
-            Failure::WrongInput(_) | Failure::Faults(_) => 2,
+            Failure::WrongInput(_) | Failure::Faults { .. } => 2,
         }
     }
 }

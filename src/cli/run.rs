@@ -21,7 +21,7 @@ pub struct Args {
 
 pub fn run(args: Args) -> Result<(), Failure> {
     log::start();
-    let mut settings = args.configuration.load()?;
+    let mut settings = args.configuration.load().map_err(|failure| failure.so("nothing was started"))?;
     if args.http.is_some() {
         settings.http.listen = args.http;
     }

@@ -80,9 +80,8 @@ pub fn run(args: Args) -> Result<(), Failure> {
             let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
             parse_script(&text).map_err(|errors| {
                 let place = path.display();
-                Failure::Faults(
-                    errors.iter().map(|(line, error)| format!("{place}:{line}: {error}")).collect(),
-                )
+                let faults = errors.iter().map(|(line, error)| format!("{place}:{line}: {error}")).collect();
+                Failure::Faults { faults, so: Some("nothing was started") }
             })?
         }
         None => Vec::new(),

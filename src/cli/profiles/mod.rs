@@ -301,7 +301,7 @@ mod tests {
     fn faults_of_a_file_end_with_exit_code_2() {
         let faulty = || vec![PathBuf::from("tests/bad-profiles/many-faults-at-once/profile.yaml")];
         match check(Library::shipped(), &faulty()) {
-            Err(Failure::Faults(faults)) => assert_eq!(faults.len(), 6, "{faults:?}"),
+            Err(Failure::Faults { faults, so: None }) => assert_eq!(faults.len(), 6, "{faults:?}"),
             other => panic!("{other:?}"),
         }
         let failure = check(Library::shipped(), &faulty()).expect_err("faults");
