@@ -2,6 +2,7 @@
 
 mod patience;
 mod telling;
+mod wear;
 
 use crate::engine::command::{Outcome, OutcomeKind, words_of};
 use crate::engine::device::{Device, Identify, Point, PointIndex};
@@ -17,6 +18,7 @@ use crate::engine::value::Missing;
 
 use super::{Context, Severity, unit_of};
 use patience::{FAILURES_UNTIL_OFFLINE, Patience};
+use wear::Wear;
 
 /// A device that is not the one that the profile describes is asked again after this.
 const PAUSE_MISMATCH: Duration = Duration::from_secs(30);
@@ -34,6 +36,7 @@ pub(super) struct DeviceState {
     refused: Vec<crate::engine::address::Span>,
     presence: Presence,
     patience: Patience,
+    wear: Wear,
     /// How long the request in flight may wait.
     asked_timeout: Duration,
     /// Nothing is asked before.
@@ -82,6 +85,7 @@ impl DeviceState {
             refused: Vec::new(),
             presence: Presence::Absent { reason: "not yet asked".into() },
             patience: Patience::default(),
+            wear: Wear::default(),
             asked_timeout: Duration::ZERO,
             paused_until: Time::default(),
             served_at: Time::default(),
@@ -130,12 +134,18 @@ impl DeviceState {
         self.settings.device.wire.watchdog.is_some()
     }
 
-    /// Whether a command to this point can begin: the device is there, is the right one, and what
-    /// decides the point's meaning is known.
-    pub(super) fn can_take(&self, point: PointIndex) -> bool {
-        self.presence == Presence::Present
+    /// Whether a command to this point can begin: the device is there, is the right one, what decides
+    /// the point's meaning is known, and its EEPROM has been spared long enough.
+    pub(super) fn can_take(&self, now: Time, point: PointIndex) -> bool {
+        now >= self.writable_at(point)
+            && self.presence == Presence::Present
             && self.patience.failures() == 0
             && self.details(point).selectors().iter().all(|selector| self.known()[*selector].is_some())
+    }
+
+    /// From when on the point may be written, for its EEPROM's sake.
+    pub(super) fn writable_at(&self, point: PointIndex) -> Time {
+        if self.details(point).persistent { self.wear.allowed_at(point) } else { Time::default() }
     }
 
     /// Why a command to this point has not begun.
@@ -426,7 +436,10 @@ impl DeviceState {
     /// A write to `point` goes out: what it decides is unknown until it has been read back.
     pub(super) fn about_to_write(&mut self, now: Time, point: PointIndex, context: &mut Context) {
         self.counters.writes += 1;
-        self.counters.persistent_writes += u64::from(self.details(point).persistent);
+        if self.details(point).persistent {
+            self.counters.persistent_writes += 1;
+            self.wear.spend(now, point);
+        }
         if self.values.is_selector(point) {
             self.values.forget_selector(&self.settings.device, point);
             self.tell_all(now, context);

@@ -210,7 +210,9 @@ impl Bus {
         }
         let of_devices =
             self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
-        of_devices.chain(self.waiting.next_deadline()).min()
+        let spared =
+            self.waiting.iter().map(|waiting| self.devices[waiting.device].writable_at(waiting.point));
+        of_devices.chain(self.waiting.next_deadline()).chain(spared.filter(|at| *at > self.now)).min()
     }
 
     /// Whether a shutdown has been asked for and nothing is in flight any more.
@@ -328,7 +330,15 @@ impl Bus {
     }
 
     fn expire_commands(&mut self) {
-        for waiting in self.waiting.take_expired(self.now) {
+        for mut waiting in self.waiting.take_expired(self.now) {
+            let device = &self.devices[waiting.device];
+            let writable_at = device.writable_at(waiting.point);
+            if writable_at > self.now {
+                // A write that had begun before it has put it off.
+                waiting.put_off(writable_at, device.details(waiting.point));
+                self.waiting.push(waiting);
+                continue;
+            }
             let reason = self.devices[waiting.device].why_not(waiting.point);
             self.end_command(
                 waiting.device,
@@ -393,9 +403,9 @@ impl Bus {
             return false;
         }
         let devices = &self.devices;
-        let Some(waiting) =
-            self.waiting.take_first(|waiting| devices[waiting.device].can_take(waiting.point))
-        else {
+        let now = self.now;
+        let can_begin = |waiting: &Waiting| devices[waiting.device].can_take(now, waiting.point);
+        let Some(waiting) = self.waiting.take_first(can_begin) else {
             return false;
         };
         let state = &mut self.devices[waiting.device];

@@ -18,10 +18,19 @@ impl Waiting {
     /// A button that works late surprises.
     const PRESS_TIME_TO_LIVE: Duration = Duration::from_secs(3);
 
-    pub fn new(now: Time, device: usize, point: PointIndex, wanted: String, details: &Point) -> Waiting {
+    /// A command that may begin at `from`.
+    pub fn new(from: Time, device: usize, point: PointIndex, wanted: String, details: &Point) -> Waiting {
+        Waiting { device, point, wanted, deadline: from + Waiting::time_to_live(details) }
+    }
+
+    /// Puts the deadline off, for a command that may not begin before `from`.
+    pub fn put_off(&mut self, from: Time, details: &Point) {
+        self.deadline = from + Waiting::time_to_live(details);
+    }
+
+    fn time_to_live(details: &Point) -> Duration {
         let press = details.write.as_ref().is_some_and(|write| matches!(write.rule, WriteRule::Press { .. }));
-        let time_to_live = if press { Waiting::PRESS_TIME_TO_LIVE } else { Waiting::TIME_TO_LIVE };
-        Waiting { device, point, wanted, deadline: now + time_to_live }
+        if press { Waiting::PRESS_TIME_TO_LIVE } else { Waiting::TIME_TO_LIVE }
     }
 }
 
@@ -65,6 +74,10 @@ impl WaitingCommands {
 
     pub fn take_all(&mut self) -> Vec<Waiting> {
         std::mem::take(&mut self.queue)
+    }
+
+    pub fn iter(&self) -> impl Iterator<Item = &Waiting> {
+        self.queue.iter()
     }
 
     pub fn next_deadline(&self) -> Option<Time> {
