@@ -130,6 +130,28 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 500, 627, ALL),
         ],
     ),
+    // Chapters 6.2.1, 6.2.2 and 7.
+    (
+        "fuehlersysteme/analog-out8",
+        &[
+            (Table::Input, 0, 8, ALL),
+            (Table::Input, 79, 79, ALL),
+            (Table::Input, 100, 227, ALL),
+            (Table::Holding, 0, 8, ALL),
+            (Table::Holding, 10, 10, 0x00FF),
+            (Table::Holding, 11, 18, ALL),
+            (Table::Holding, 21, 28, ALL),
+            (Table::Holding, 31, 38, ALL),
+            (Table::Holding, 40, 40, 0x00FF),
+            (Table::Holding, 41, 48, ALL),
+            (Table::Holding, 51, 58, ALL),
+            (Table::Holding, 61, 68, ALL),
+            (Table::Holding, 79, 79, ALL),
+            (Table::Holding, 90, 99, ALL),
+            (Table::Holding, 200, 327, ALL),
+            (Table::Holding, 500, 627, ALL),
+        ],
+    ),
 ];
 
 #[test]
