@@ -1,4 +1,9 @@
-//! `busker simulate` as a person uses it: arguments, commands on its standard input, and its end.
+//! `busker simulate` as a person uses it: arguments, commands on its standard input, and its end; and
+//! the simulated devices against the profiles.
+
+#[path = "../strangers/broker.rs"]
+mod broker;
+mod two_readings;
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -7,6 +12,7 @@ use std::process::{Child, ChildStdin, Command, Output, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
+use busker::simulator::Model;
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Far longer than anything here takes; only a failing test waits for it.
@@ -26,12 +32,12 @@ fn run(arguments: &[&str]) -> Output {
 #[test]
 fn the_help_shows_devices_commands_faults_and_an_example() {
     let told = String::from_utf8(run(&["--help"]).stdout).expect("text");
-    for wanted in [
-        "  metz-connect/mr-do4\n  metz-connect/mr-si4\n  metz-connect/mr-ai8\n  fuehlersysteme/relay8\n",
+    let devices = Model::ALL.map(|model| format!("\n  {model}\n"));
+    for wanted in devices.iter().map(String::as_str).chain([
         "  unit N input I ohms X | volts X | celsius X | open\n",
         "wrong-identity",
         "Example:\n  busker simulate metz-connect/mr-do4@18 metz-connect/mr-ai8@19 --pty /tmp/line",
-    ] {
+    ]) {
         assert!(told.contains(wanted), "{wanted:?} in\n{told}");
     }
 }

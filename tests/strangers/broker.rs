@@ -108,4 +108,11 @@ impl Listener {
             self.last.insert(topic_told, payload);
         }
     }
+
+    /// Compares what `topic` has said last.
+    #[track_caller]
+    pub fn check(&self, topic: &str, is_it: impl Fn(&str) -> bool) {
+        let told = self.last.get(topic);
+        assert!(told.is_some_and(|payload| is_it(payload)), "`{topic}` says {told:?}");
+    }
 }
