@@ -4,6 +4,8 @@ use std::fmt;
 
 use crate::engine::time::{Duration, Time};
 use crate::simulator::btr;
+use crate::simulator::fuehlersysteme::analog_in8::AnalogIn8;
+use crate::simulator::fuehlersysteme::analog_out8::AnalogOut8;
 use crate::simulator::fuehlersysteme::relay8::Relay8;
 use crate::simulator::metz_connect::MetzConnect;
 use crate::simulator::metz_connect::mr_ai8::MrAi8;
@@ -172,10 +174,12 @@ pub enum Model {
     MrTo4,
     BtrMrAi8,
     Relay8,
+    AnalogOut8,
+    AnalogIn8,
 }
 
 impl Model {
-    pub const ALL: [Model; 12] = [
+    pub const ALL: [Model; 14] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,
@@ -188,6 +192,8 @@ impl Model {
         Model::MrTo4,
         Model::BtrMrAi8,
         Model::Relay8,
+        Model::AnalogOut8,
+        Model::AnalogIn8,
     ];
 
     /// The identifier of the device's profile.
@@ -205,6 +211,8 @@ impl Model {
             Model::MrTo4 => "metz-connect/mr-to4",
             Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
+            Model::AnalogOut8 => "fuehlersysteme/analog-out8",
+            Model::AnalogIn8 => "fuehlersysteme/analog-in8",
         }
     }
 
@@ -227,6 +235,8 @@ impl Model {
             Model::MrTo4 => Box::new(MetzConnect::new(now, line, MrTo4::new(now))),
             Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
+            Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),
+            Model::AnalogIn8 => Box::new(AnalogIn8::new(now)),
         }
     }
 }
@@ -315,6 +325,7 @@ mod tests {
             Just(Signal::Open),
             (-1e9..1e9f64).prop_map(Signal::Ohms),
             (-1e3..1e3f64).prop_map(Signal::Volts),
+            (-1e3..1e3f64).prop_map(Signal::Milliamps),
             (-1e3..1e3f64).prop_map(Signal::Celsius),
             any::<bool>().prop_map(Signal::Contact),
             (0..1000u64, 1..100u64)
@@ -324,6 +335,9 @@ mod tests {
         prop_oneof![
             Just(Stimulus::Button),
             (0..6u8).prop_map(|relay| Stimulus::Hand { relay, position: Hand::On }),
+            (0..6u8, 0.0..12.0f64)
+                .prop_map(|(output, volts)| Stimulus::HandVolts { output, volts: Some(volts) }),
+            (0..10u8, any::<bool>()).prop_map(|(switch, on)| Stimulus::Dip { switch, on }),
             (0..10u8, signal).prop_map(|(input, signal)| Stimulus::Input { input, signal }),
         ]
     }
@@ -347,8 +361,9 @@ mod tests {
                 device.advance(now);
                 if let Some(reply) = device.request(now, Addressed::Unit, &pdu) {
                     prop_assert!((2..=253).contains(&reply.len()), "{:02X?}: {:02X?}", pdu, reply);
-                    // The relay board's function 6 refuses a value with the exception of function 4.
-                    let excepted = model == Model::Relay8 && pdu[0] == 6 && reply == [0x84, 3];
+                    // Function 6 of these boards refuses a value with the exception of function 4.
+                    let is_board = model.id().starts_with("fuehlersysteme/");
+                    let excepted = is_board && pdu[0] == 6 && reply == [0x84, 3];
                     prop_assert!(reply[0] | 0x80 == pdu[0] | 0x80 || excepted, "{:02X?}: {:02X?}", pdu, reply);
                 }
                 prop_assert_eq!(device.eeprom().len(), length);

@@ -35,8 +35,8 @@ pub const COMMANDS: &str = "  unit N relay R hand on|off|automatic      a relay'
   unit N input I ohms X | volts X | celsius X | open
                                             what is connected to an input (MR-AI8)
   unit N input I volts X | milliamps X | open
-                                            what is connected to an input (MR-CI4)
-  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10)
+                                            what is connected to an input (MR-CI4, analog-in8)
+  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, analog-in8)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
   unit N dip D on|off                       a DIP switch (MR-CI4)

@@ -1,4 +1,8 @@
 //! Devices of FuehlerSysteme eNET: the manual for their Modbus systems.
 
+pub mod analog_in8;
+pub mod analog_out8;
+mod board;
+mod ranges;
 mod relay;
 pub mod relay8;
