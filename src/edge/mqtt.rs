@@ -31,6 +31,9 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
 const RECONNECT_FIRST: Duration = Duration::from_millis(500);
 const RECONNECT_LAST: Duration = Duration::from_secs(30);
 
+/// A connection that held this long counts as a good one: after it the waits begin anew.
+const GOOD_CONNECTION: Duration = Duration::from_secs(10);
+
 /// How long the last messages may take when the program ends.
 const GOODBYE: Duration = Duration::from_secs(3);
 
@@ -180,11 +183,11 @@ enum Seen {
 /// pings. Waits between attempts to connect, a little longer each time.
 async fn poll(mut event_loop: EventLoop, seen: mpsc::Sender<Seen>, address: String, clock: Clock) {
     let mut attempts = 0;
+    let mut connected_at = None;
     loop {
         let news = match event_loop.poll().await {
-            Ok(rumqttc::Event::Incoming(Packet::ConnAck(answer))) => {
-                debug_assert_eq!(answer.code, ConnectReturnCode::Success);
-                attempts = 0;
+            Ok(rumqttc::Event::Incoming(Packet::ConnAck(_))) => {
+                connected_at = Some(clock.now());
                 Seen::Up
             }
             Ok(rumqttc::Event::Incoming(packet)) => Seen::Packet(packet),
@@ -194,6 +197,10 @@ async fn poll(mut event_loop: EventLoop, seen: mpsc::Sender<Seen>, address: Stri
                 event_loop.state.collision = None;
                 if seen.send(Seen::Down(reason(&error, &address))).await.is_err() {
                     return;
+                }
+                // Two gateways of one name throw each other out; then the waits shall grow as well.
+                if connected_at.take().is_some_and(|since| clock.now() - since >= GOOD_CONNECTION) {
+                    attempts = 0;
                 }
                 tokio::time::sleep(reconnect_after(attempts, clock.now().0)).await;
                 attempts += 1;

@@ -25,6 +25,9 @@ pub struct Outbox {
     own_devices: BTreeSet<String>,
     /// What an earlier run announced of devices that this one has not announced yet.
     remembered: BTreeMap<String, Announcement>,
+    /// What was taken away since Home Assistant last said that it listens. If it was not there to
+    /// hear, it is told again when it starts.
+    departed: BTreeMap<String, Announcement>,
     retained: BTreeMap<String, Retained>,
     queue: VecDeque<Queued>,
     once_waiting: usize,
@@ -64,6 +67,7 @@ impl Outbox {
             discovery_prefix: format!("{discovery_prefix}/device/"),
             own_devices: own.collect(),
             remembered: BTreeMap::new(),
+            departed: BTreeMap::new(),
             retained: BTreeMap::new(),
             queue: VecDeque::new(),
             once_waiting: 0,
@@ -127,6 +131,7 @@ impl Outbox {
             self.remembered.insert(topic.to_string(), found);
         } else {
             self.queue.push_back(Queued::Removal(topic.to_string()));
+            self.departed.insert(topic.to_string(), found);
         }
     }
 
@@ -141,6 +146,21 @@ impl Outbox {
             self.push_once(Message { retain: false, ..found.message() });
             self.push_once(farewell);
             self.push_retained(message);
+            self.departed.insert(found.topic().to_string(), found);
+        }
+    }
+
+    /// Takes away once more what was taken away while Home Assistant may not have listened: it keeps
+    /// entities over its own restart, and lets go only of what it has been told since.
+    fn take_leave_again(&mut self) {
+        for (topic, found) in std::mem::take(&mut self.departed) {
+            if self.retained.contains_key(&topic) {
+                self.take_leave(found);
+                self.departed.remove(&topic);
+            } else {
+                self.push_once(Message { retain: false, ..found.message() });
+                self.queue.push_back(Queued::Removal(topic));
+            }
         }
     }
 
@@ -171,6 +191,7 @@ impl Outbox {
     /// Home Assistant has started: it is told of all devices now, and of all values when it has had
     /// the time to listen ([`Outbox::wake_at`]).
     pub fn home_assistant_started(&mut self, now: Time) {
+        self.take_leave_again();
         self.queue_again(|rank| rank == Rank::Discovery);
         self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
     }
@@ -448,6 +469,30 @@ mod tests {
         let removal = outbox.next_message().expect("the device is removed");
         outbox.put_back(removal);
         check_sent(&mut outbox, &["homeassistant/device/busker_gone/config "]);
+    }
+
+    #[test]
+    fn what_was_taken_away_while_home_assistant_was_not_there_is_taken_away_again_once() {
+        let config = "homeassistant/device/busker_boiler/config";
+        let gone = "homeassistant/device/busker_gone/config";
+        let (old, new) = (announcement(&["flow", "level"]), announcement(&["level"]));
+        let mut outbox = outbox();
+        retained(&mut outbox, config, &new);
+        outbox.found(config, &old);
+        outbox.found(gone, &old);
+        while outbox.next_message().is_some() {}
+        outbox.home_assistant_started(Time::from_millis(0));
+        let farewell = announcement(&["level", "flow"]);
+        let expected = [
+            format!("{config} {old}!"),
+            format!("{config} {farewell}!"),
+            format!("{config} {new}"),
+            format!("{gone} {old}!"),
+            format!("{gone} "),
+        ];
+        check_sent(&mut outbox, &expected.each_ref().map(String::as_str));
+        outbox.home_assistant_started(Time::from_millis(60_000));
+        check_sent(&mut outbox, &[&expected[2]]);
     }
 
     #[test]
