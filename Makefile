@@ -7,11 +7,12 @@ WITH_MOSQUITTO = tools=$$(scripts/get-mosquitto) && PATH="$$PATH:$$tools"
 
 # The whole program without hardware: simulated devices, a broker, the gateway. Ctrl-C ends it.
 demo:
-	@$(WITH_MOSQUITTO) exec cargo run --quiet --locked -- demo
+	@$(WITH_MOSQUITTO) exec cargo run --locked -- demo
 
-# Every test that needs no large download.
+# Every test that needs no large download. The program is built first as `make demo` builds it (without
+# what only tests need), so that the test of `make demo` waits for the demo and not for the compiler.
 test:
-	@$(WITH_MOSQUITTO) exec cargo test --locked
+	@$(WITH_MOSQUITTO) cargo build --locked && exec cargo test --locked
 
 # The discovery messages against a real Home Assistant core; downloads about 800 MB the first time.
 test-home-assistant:
