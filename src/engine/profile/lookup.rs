@@ -28,20 +28,12 @@ impl Resolution<'_, '_> {
 
     /// All points that `path` names: those of the same repetition as `from`, or else those at the top.
     pub fn lookup_all(&mut self, path: &At<PointPath>, from: Option<&Expanded<'_>>) -> Vec<PointIndex> {
-        let group =
-            from.and_then(|from| from.group.as_ref().map(|group| (format!("{group}."), from.repetition)));
-        let mut found = Vec::new();
-        if let Some((prefix, repetition)) = &group {
-            let beside = format!("{prefix}{}", path.value.0);
-            found = self.with_path(&beside, |point| point.repetition == *repetition);
-        }
-        if found.is_empty() {
-            found = self.with_path(&path.value.0, |_| true);
-        }
+        let found = self.find(&path.value, from);
         if found.is_empty() && !self.may_be_unread(&path.value.0) {
+            let prefix = prefix_of_group(from);
             let mut known: Vec<&str> = Vec::new();
             for point in self.points {
-                let local = group.as_ref().and_then(|(prefix, _)| point.path.strip_prefix(prefix.as_str()));
+                let local = prefix.as_ref().and_then(|prefix| point.path.strip_prefix(prefix.as_str()));
                 let name = local.unwrap_or(&point.path);
                 if !known.contains(&name) {
                     known.push(name);
@@ -51,6 +43,23 @@ impl Resolution<'_, '_> {
             self.faults.add(&path.place, format!("no point is called `{}`; {choices}", path.value.0));
         }
         found
+    }
+
+    /// As `lookup_all`, but it is no fault if there is none.
+    fn find(&self, path: &PointPath, from: Option<&Expanded<'_>>) -> Vec<PointIndex> {
+        if let (Some(prefix), Some(from)) = (prefix_of_group(from), from) {
+            let beside =
+                self.with_path(&format!("{prefix}{}", path.0), |point| point.repetition == from.repetition);
+            if !beside.is_empty() {
+                return beside;
+            }
+        }
+        self.with_path(&path.0, |_| true)
+    }
+
+    /// Whether the device surely has no point that `path` names.
+    pub fn is_missing(&self, path: &PointPath, from: &Expanded<'_>) -> bool {
+        self.find(path, Some(from)).is_empty() && !self.may_be_unread(&path.0)
     }
 
     fn with_path(&self, path: &str, and: impl Fn(&Expanded<'_>) -> bool) -> Vec<PointIndex> {
@@ -66,4 +75,9 @@ impl Resolution<'_, '_> {
         let mut groups = self.profile.points.iter().filter_map(|(_, point)| point.points.as_ref());
         has_unread(&self.profile.points) || groups.any(|group| has_unread(group))
     }
+}
+
+/// `channel.` of a point in the group `channel`.
+fn prefix_of_group(from: Option<&Expanded<'_>>) -> Option<String> {
+    Some(format!("{}.", from?.group.as_ref()?))
 }

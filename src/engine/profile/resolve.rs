@@ -8,11 +8,11 @@ use crate::engine::device::{
     Quirks, Unit, Write, WriteRule,
 };
 use crate::engine::profile::expand::Expanded;
-use crate::engine::profile::file::{Cases, Form, Profile, Values};
+use crate::engine::profile::file::{Cases, Form, Profile, SharedCase, Values};
 use crate::engine::profile::shared::Shared;
 use crate::engine::profile::text::{Digits, PointPath, Quirk, Writable};
 use crate::engine::value::Decimal;
-use crate::engine::yaml::{At, Faults, list_of_choices};
+use crate::engine::yaml::{At, Faults, Map, Place, list_of_choices};
 
 /// The device that `profile`, expanded to `points`, describes.
 pub fn device(profile: &Profile, points: &[Expanded<'_>], shared: &Shared, faults: &mut Faults) -> Device {
@@ -196,13 +196,8 @@ impl Resolution<'_, '_> {
             Cases::Shared(file) => {
                 let shared = self.shared;
                 let Some(listed) = shared.get(file) else { return unknown };
-                if let Some(unit) = &expanded.file.form.unit {
-                    if !listed.iter().any(|(_, case)| case.form.unit_by.is_some()) {
-                        self.faults.add(
-                            &unit.place,
-                            format!("`unit` beside `{file}`, where no case has a `unit_by` that it could replace; remove it"),
-                        );
-                    }
+                if !self.has_unit_of_shared_cases(expanded, file, listed, &cases.place) {
+                    return unknown;
                 }
                 for (key, name) in &names {
                     match listed.get(key).filter(|case| case.name.value == *name) {
@@ -224,6 +219,40 @@ impl Resolution<'_, '_> {
             );
         }
         Encoding::Cases { by: by_index, cases: resolved }
+    }
+
+    /// Whether what the shared cases say of units can be resolved: with the point that they name, or with
+    /// a unit in its place.
+    fn has_unit_of_shared_cases(
+        &mut self,
+        expanded: &Expanded<'_>,
+        file: &str,
+        cases: &Map<i128, SharedCase>,
+        place: &Place,
+    ) -> bool {
+        let mut named = cases.iter().filter_map(|(_, case)| case.form.unit_by.as_ref());
+        match &expanded.file.form.unit {
+            Some(unit) => {
+                if named.next().is_none() {
+                    self.faults.add(
+                        &unit.place,
+                        format!("`unit` beside `{file}`, where no case has a `unit_by` that it could replace; remove it"),
+                    );
+                }
+                true
+            }
+            None => {
+                let missing = named.find(|path| self.is_missing(&path.value, expanded));
+                if let Some(missing) = missing {
+                    let missing = &missing.value.0;
+                    self.faults.add(
+                        place,
+                        format!("`{file}` takes units from `{missing}`, but no point is called so; expected that point, or `unit` beside this"),
+                    );
+                }
+                missing.is_none()
+            }
+        }
     }
 
     fn order(&self) -> Order {
