@@ -19,8 +19,8 @@ use crate::engine::settings::{
 };
 use crate::engine::time::Duration;
 use crate::engine::yaml::{
-    At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, parse, read,
-    schema_of,
+    At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, nearest, parse,
+    read, schema_of,
 };
 
 /// Something that works and may still be a mistake.
@@ -359,8 +359,11 @@ impl Resolver<'_> {
 
     fn profile(&mut self, wanted: &At<String>) -> Option<Device> {
         if !self.library.contains(wanted) {
-            let choices = list_of_choices(wanted, &self.library.ids());
-            self.faults.add(&wanted.place, format!("unknown profile `{}`; {choices}", wanted.value));
+            let remedy = match nearest(wanted, &self.library.ids()) {
+                Some(meant) => format!("did you mean `{meant}`?"),
+                None => "`busker profiles list` lists them".into(),
+            };
+            self.faults.add(&wanted.place, format!("unknown profile `{}`; {remedy}", wanted.value));
             return None;
         }
         self.library.load(wanted).map_err(|faults| self.faults.extend(faults)).ok()
