@@ -22,7 +22,8 @@ lint:
 	cargo fmt --check
 	cargo clippy --locked --all-targets -- -D warnings
 
-# Rewrites the goldens, the messages of faulty files and the schemas from what the program does now.
+# Rewrites the goldens, the messages of faulty files, the schemas and the pages of docs/devices from
+# what the program does now.
 # Read the difference before committing it.
 goldens:
 	@$(WITH_MOSQUITTO) && BLESS=1 exec cargo test --locked

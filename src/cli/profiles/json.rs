@@ -5,7 +5,7 @@ use serde_json::{Map, Value as Json, json};
 use super::access;
 use crate::engine::address::Span;
 use crate::engine::device::{
-    Case, Decimals, Device, Encoding, Form, Identify, Kind, Order, PointIndex, Unit, WriteRule,
+    Case, Decimals, Device, Encoding, Form, Identify, Kind, Order, Point, PointIndex, Unit, WriteRule,
 };
 use crate::engine::homeassistant::entity;
 use crate::engine::value::Decimal;
@@ -174,14 +174,7 @@ fn case_json(device: &Device, case: &Case) -> Json {
 /// What Home Assistant shows, whatever the registers that decide hold. Of a point with cases: what
 /// all of its cases agree in.
 fn entity_json(device: &Device, index: PointIndex) -> Json {
-    let usual: Vec<Option<i128>> = device
-        .points
-        .iter()
-        .map(|point| {
-            let named = point.plain().and_then(|form| form.names.list().first()).map(|(raw, _)| *raw);
-            Some(point.default.or(named).unwrap_or(0))
-        })
-        .collect();
+    let usual = usual_registers(device);
     let all: Vec<Json> = match &device.points[index].encoding {
         Encoding::Plain(_) => {
             entity(device, index, &usual).into_iter().map(|entity| entity.to_json()).collect()
@@ -205,6 +198,16 @@ fn entity_json(device: &Device, index: PointIndex) -> Json {
         agreed
     });
     agreed.unwrap_or(Json::Null)
+}
+
+/// What the registers that decide about others hold while nobody has changed them: the factory
+/// setting, or else the first that the profile names.
+pub fn usual_registers(device: &Device) -> Vec<Option<i128>> {
+    let usual = |point: &Point| {
+        let named = point.plain().and_then(|form| form.names.list().first()).map(|(raw, _)| *raw);
+        Some(point.default.or(named).unwrap_or(0))
+    };
+    device.points.iter().map(usual).collect()
 }
 
 fn point_is_difference(encoding: &Encoding) -> bool {

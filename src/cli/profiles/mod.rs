@@ -1,5 +1,6 @@
 //! `busker profiles`: the device profiles there are, and whether one's own is right.
 
+mod docs;
 mod json;
 
 use std::fs;
@@ -15,7 +16,7 @@ use crate::engine::device::{Device, Encoding, Point, Poll, Unit};
 use crate::engine::profile::{self, Library};
 use crate::engine::yaml::list_of_choices;
 
-/// List, show and check device profiles
+/// List, show, check and document device profiles
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  busker profiles show metz-connect/mr-do4")]
 pub struct Args {
@@ -51,6 +52,7 @@ enum What {
         #[arg(value_name = "FILE", required = true)]
         files: Vec<PathBuf>,
     },
+    Docs(docs::Args),
     /// The JSON Schema of a profile file, for editors
     #[command(after_help = "Example:\n  busker profiles schema > profile.schema.json")]
     Schema,
@@ -67,6 +69,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
         What::List { json } => list(&library, json),
         What::Show { id, json } => show(&library, &id, json),
         What::Check { files } => check(library, &files),
+        What::Docs(args) => docs::run(&args, &library),
         What::Schema => output::print(&schema()?),
     }
 }

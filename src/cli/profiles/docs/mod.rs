@@ -1,0 +1,260 @@
+//! `busker profiles docs`: a page for people about each device, and the list of all of them.
+
+mod page;
+mod points;
+mod words;
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+
+use super::super::{Failure, configuration, output};
+use crate::engine::device::Device;
+use crate::engine::profile::Library;
+
+/// Write a page for people about each device, and the list of all devices
+///
+/// The pages are Markdown: `DIR/<manufacturer>/<device>.md`, and `DIR/README.md` for the list. A page
+/// says what the device shows in Home Assistant, what to mind, what to copy into the configuration,
+/// and every point with its place, range and factory setting.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  busker profiles docs --output docs/devices")]
+pub struct Args {
+    /// The folder to write into
+    #[arg(long, value_name = "DIR", default_value = "docs/devices")]
+    output: PathBuf,
+}
+
+pub fn run(args: &Args, library: &Library) -> Result<(), Failure> {
+    let files = files(library)?;
+    for (path, text) in &files {
+        let place = args.output.join(path);
+        write(&place, text).with_context(|| format!("cannot write `{}`", place.display()))?;
+    }
+    output::print(&format!("{} pages in {}\n", files.len(), args.output.display()))
+}
+
+fn write(place: &Path, text: &str) -> std::io::Result<()> {
+    if let Some(folder) = place.parent() {
+        fs::create_dir_all(folder)?;
+    }
+    fs::write(place, text)
+}
+
+/// Every file by its path below the folder.
+fn files(library: &Library) -> Result<Vec<(String, String)>, Failure> {
+    let mut devices = Vec::new();
+    let mut faults = Vec::new();
+    for id in library.ids() {
+        match library.load(id) {
+            Ok(device) => devices.push(device),
+            Err(found) => faults.extend(found),
+        }
+    }
+    if !faults.is_empty() {
+        return Err(configuration::faults(faults).so("nothing was written"));
+    }
+    let mut files = vec![("README.md".to_string(), list(&devices))];
+    files.extend(devices.iter().map(|device| (format!("{}.md", device.profile), page::page(device))));
+    Ok(files)
+}
+
+fn list(devices: &[Device]) -> String {
+    let mut text = String::from(
+        "# Supported devices
+
+<!-- Written by `busker profiles docs` from the profiles; do not edit. -->
+
+Each page says what the device shows in Home Assistant, what to mind, and what to copy into the configuration.
+Your device is not here? Its manual and an evening are enough:
+[device-profiles/README.md](../../device-profiles/README.md).
+",
+    );
+    let mut manufacturer = "";
+    for device in devices {
+        if device.manufacturer != manufacturer {
+            manufacturer = &device.manufacturer;
+            let _ = writeln!(
+                text,
+                "\n## {manufacturer}\n\n| Device | Main values and controls | Points |\n|---|---|---:|"
+            );
+        }
+        let shown: Vec<String> = page::main_entities(device).into_iter().map(|(_, names)| names).collect();
+        let _ = writeln!(
+            text,
+            "| [{}]({}.md) | {} | {} |",
+            device.model,
+            device.profile,
+            shown.join(", "),
+            device.points.len()
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    const FOLDER: &str = "docs/devices";
+
+    #[test]
+    fn the_pages_that_are_checked_in_are_the_programs_and_their_links_lead_somewhere() {
+        let files = files(&Library::shipped()).expect("good profiles");
+        for (path, text) in &files {
+            let place = Path::new(FOLDER).join(path);
+            if std::env::var_os("BLESS").is_some() {
+                write(&place, text).expect("the page can be written");
+            }
+            let checked_in = fs::read_to_string(&place).unwrap_or_default();
+            let old = place.display();
+            assert!(
+                checked_in == *text,
+                "{old} is old; `busker profiles docs` or `make goldens` writes it anew"
+            );
+        }
+        let known: BTreeSet<PathBuf> = files.iter().map(|(path, _)| Path::new(FOLDER).join(path)).collect();
+        let mut there = BTreeSet::new();
+        files_below(Path::new(FOLDER), &mut there);
+        assert_eq!(there, known, "a page of no shipped profile is to be removed");
+        files.iter().for_each(|(path, text)| check_links(path, text));
+    }
+
+    fn files_below(folder: &Path, found: &mut BTreeSet<PathBuf>) {
+        for entry in fs::read_dir(folder).expect("the folder is there") {
+            let path = entry.expect("it can be listed").path();
+            if path.is_dir() {
+                files_below(&path, found);
+            } else {
+                found.insert(path);
+            }
+        }
+    }
+
+    #[test]
+    fn the_verb_writes_them_where_it_is_told_to() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let args = Args { output: folder.path().join("pages") };
+        run(&args, &Library::shipped()).expect("they are written");
+        let mut there = BTreeSet::new();
+        files_below(&args.output, &mut there);
+        for (path, text) in files(&Library::shipped()).expect("good profiles") {
+            let place = args.output.join(path);
+            assert_eq!(fs::read_to_string(&place).ok(), Some(text), "{}", place.display());
+            assert!(there.remove(&place));
+        }
+        assert!(there.is_empty(), "{there:?}");
+    }
+
+    fn check_links(path: &str, text: &str) {
+        for link in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+            let there = match link.strip_prefix("#table-") {
+                Some(number) => text.contains(&format!("\n### Table {number}\n")),
+                None => Path::new(FOLDER).join(path).with_file_name(link).exists(),
+            };
+            assert!(there, "{path} links to {link}, which is not there");
+        }
+    }
+
+    #[test]
+    fn the_configuration_of_each_page_is_accepted_as_it_stands_and_with_its_wishes() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("busker.yaml");
+        let library = Library::shipped();
+        for id in library.ids() {
+            let page = page::page(&library.load(id).expect("a good profile"));
+            let copied = page.split("```yaml\n").nth(1).and_then(|rest| rest.split("```").next());
+            let copied = copied.expect("there is something to copy");
+            let with_wishes: String = copied
+                .lines()
+                .map(|line| line.replacen("    # ", "    ", usize::from(line.starts_with("    # "))) + "\n")
+                .collect();
+            assert_ne!(copied, with_wishes, "{id}");
+            for text in [copied, &with_wishes] {
+                fs::write(&path, text).expect("a file");
+                let loaded = configuration::load(&path).expect("it can be read");
+                let loaded = loaded.unwrap_or_else(|faults| panic!("{id}: {}\n{text}", faults[0]));
+                assert_eq!(loaded.warnings, [], "{id}");
+                let [device] = loaded.settings.devices.as_slice() else { panic!("{id}: one device") };
+                assert_eq!(device.device.profile, id);
+            }
+        }
+    }
+
+    #[test]
+    fn each_point_stands_in_the_list_of_addresses_and_each_left_out_span_with_its_reason() {
+        let library = Library::shipped();
+        for id in library.ids() {
+            let device = library.load(id).expect("a good profile");
+            let page = page::page(&device);
+            let (_, list) = page.split_once("## Every point and its address\n").expect("the list");
+            for point in &device.points {
+                let row = format!("| `{}` | ", point.name);
+                let rows: Vec<&str> = list.lines().filter(|line| line.starts_with(&row)).collect();
+                let [row] = rows.as_slice() else { panic!("{id} {}: {rows:?}", point.name) };
+                assert!(row.contains(&format!("| {}", point.at)), "{id} {row}");
+            }
+            for left_out in &device.left_out {
+                let told = format!("* {}: {}\n", left_out.span, left_out.reason.trim());
+                assert!(page.contains(&told), "{id} {told}");
+            }
+        }
+    }
+
+    /// The page holds each of `expected`.
+    #[track_caller]
+    fn check_page(id: &str, expected: &[&str]) {
+        let page = page::page(&Library::shipped().load(id).expect("a good profile"));
+        for expected in expected {
+            assert!(page.contains(expected), "{id}: {expected:?} is not in\n{page}");
+        }
+    }
+
+    #[test]
+    fn a_page_says_what_the_manual_says() {
+        check_page(
+            "metz-connect/mr-do4",
+            &[
+                "# METZ CONNECT MR-DO4\n",
+                "expects `METZ CONNECT GmbH` and `MR-DO4`",
+                "* **Switches**: Relay 1 to 4\n",
+                "* **Watchdog.** `watchdog` is a time.",
+                "From the factory it is 0 s.",
+                "* **EEPROM.** 5 settings",
+                "| A question must lie within | coil 0..7; holding 0..1; holding 66 |",
+                "| 8 points every 500 ms, 5 points every 30 s |",
+                "| `watchdog` | Watchdog time | number | s | 0 to 655.35 in steps of 0.01 | 0 | yes | EEPROM | holding 66 |",
+                "| `relay_3` | Relay 3 | coil 2, also holding 0.2 |",
+            ],
+        );
+        check_page(
+            "metz-connect/mr-ai8",
+            &[
+                "| as `channel_N_code` says: [table 1](#table-1) |",
+                "| `pt100_integer` | 129 | °C or °F, as `temperature_unit` says | -50 to 150 in steps of 0.1 |",
+                // An offset may be as large as the measuring range is wide.
+                "| `pt100_integer` | 129 | °C or °F, as `temperature_unit` says | -200 to 200 in steps of 0.1 |",
+            ],
+        );
+        check_page(
+            "fuehlersysteme/relay8",
+            &[
+                "it reads input 0 and expects 20480",
+                "* **Buttons.** `relay_1_release` to `relay_8_release`, `release_all`, `restart`:",
+                "| An answer is awaited | at least 300 ms; longer if the bus says so |",
+                "| A value out of range | the device takes the nearest",
+                "| Relay 1 to 8 | binary sensor | `ON`, `OFF` |  | no | input 1 to 8, also input 9.0 to 9.7 |",
+                "| 0 to 255; or `automatic` | `automatic` |",
+                "| a letter and a number, as `R017` | `S000` |",
+            ],
+        );
+        check_page(
+            "metz-connect/mr-si4",
+            &["`meter_N_decimals` says how many digits stand behind the dot", "yes, with function 16 only"],
+        );
+    }
+}

@@ -1,0 +1,292 @@
+//! The points of a device in tables: what they mean, repeated ones in one row; lists that are too long
+//! for a cell; and every point with its address.
+
+use std::fmt::Write as _;
+
+use super::page::Page;
+use super::words;
+use crate::engine::address::{Address, Bits, Table};
+use crate::engine::device::{Category, Encoding, PointIndex, Unit};
+
+/// Writes all of it.
+pub fn points(page: &Page<'_>, text: &mut String) {
+    let tables = LongTable::all_of(page);
+    let _ = writeln!(
+        text,
+        "## Points\n\nPoints that differ only in their number share a row, and N stands for that number. *Off*: \
+         there in Home Assistant, but switched off.\n"
+    );
+    for (title, category) in [
+        ("Values and controls", None),
+        ("Settings", Some(Category::Config)),
+        ("Diagnostics", Some(Category::Diagnostic)),
+    ] {
+        let of_category = |index: &PointIndex| {
+            page.entities[*index].as_ref().and_then(|entity| entity.category) == category
+        };
+        let points: Vec<PointIndex> = (0..page.device.points.len()).filter(of_category).collect();
+        if !points.is_empty() {
+            let _ = writeln!(text, "### {title}\n");
+            meanings(page, &tables, &points, text);
+        }
+    }
+    for (number, table) in tables.iter().enumerate() {
+        let _ = writeln!(text, "### Table {}\n", number + 1);
+        table.write(page, text);
+    }
+    addresses(page, text);
+}
+
+/// What one row says. Compared cell by cell to see what can share a row.
+#[derive(PartialEq)]
+struct Row {
+    /// Before and behind the number.
+    frame: (String, String),
+    platform: String,
+    unit: String,
+    range: String,
+    default: String,
+    writing: String,
+    kept: &'static str,
+}
+
+const TITLES: [&str; 9] = [
+    "Point",
+    "In Home Assistant",
+    "Shown as",
+    "Unit",
+    "Can be",
+    "Factory setting",
+    "Can be written",
+    "Kept in",
+    "Address",
+];
+
+fn meanings(page: &Page<'_>, tables: &[LongTable], points: &[PointIndex], text: &mut String) {
+    let mut rows: Vec<(Row, Vec<PointIndex>)> = Vec::new();
+    for &index in points {
+        let row = Row::of(page, tables, index);
+        match rows.iter_mut().find(|(known, _)| *known == row) {
+            Some((_, sharing)) => sharing.push(index),
+            None => rows.push((row, vec![index])),
+        }
+    }
+    let rows: Vec<[String; 9]> = rows.into_iter().map(|(row, sharing)| row.cells(page, &sharing)).collect();
+    // A column in which nothing stands only makes the others narrow.
+    let filled: Vec<usize> =
+        (0..TITLES.len()).filter(|column| rows.iter().any(|row| !row[*column].is_empty())).collect();
+    let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
+    text.push_str(&line(filled.iter().map(|column| TITLES[*column].to_string()).collect()));
+    text.push_str(&format!("|{}\n", "---|".repeat(filled.len())));
+    for row in &rows {
+        text.push_str(&line(filled.iter().map(|column| words::cell(&row[*column])).collect()));
+    }
+    text.push('\n');
+}
+
+impl Row {
+    fn of(page: &Page<'_>, tables: &[LongTable], index: PointIndex) -> Row {
+        let device = page.device;
+        let point = &device.points[index];
+        let (frame, number) = words::around_first_number(&point.name);
+        // Beside its siblings a point speaks of its own number as N.
+        let own = number.map(|number| format!("`{}{number}_", frame.0)).unwrap_or("`".into());
+        let with_n = number.map(|_| format!("`{}N_", frame.0)).unwrap_or("`".into());
+        let of_any = |text: String| text.replace(&own, &with_n);
+        let (unit, range) = match &point.encoding {
+            Encoding::Plain(form) => {
+                let link = LongTable::link(tables, |table| table.names_of.contains(&index));
+                (words::unit(device, form), words::range(device, index, form, link.as_deref()))
+            }
+            Encoding::Cases { by, .. } => {
+                let link =
+                    LongTable::link(tables, |table| table.cases_of.contains(&index)).unwrap_or_default();
+                (String::new(), format!("as `{}` says: {link}", device.points[*by].name))
+            }
+        };
+        let platform = page.entities[index].as_ref().map(|entity| {
+            let off = if entity.enabled { "" } else { ", *off*" };
+            format!("{}{off}", words::platform(entity.platform).0)
+        });
+        Row {
+            frame: (frame.0.to_string(), frame.1.to_string()),
+            platform: platform.unwrap_or_default(),
+            unit: of_any(unit),
+            range: of_any(range),
+            default: words::default(device, index),
+            writing: words::writing(point),
+            kept: if point.persistent { "EEPROM" } else { "" },
+        }
+    }
+
+    fn cells(self, page: &Page<'_>, sharing: &[PointIndex]) -> [String; 9] {
+        let shown: Vec<&str> = sharing
+            .iter()
+            .filter_map(|index| page.entities[*index].as_ref())
+            .map(|entity| entity.name.as_str())
+            .collect();
+        let at = |index: &PointIndex| Some(page.device.points[*index].at);
+        let also = |index: &PointIndex| page.device.points[*index].also;
+        let mut places = from_to(sharing, at).unwrap_or_default();
+        if let Some(also) = from_to(sharing, also) {
+            places += &format!(", also {also}");
+        }
+        [
+            page.names(sharing),
+            words::together_plain(&shown),
+            self.platform,
+            self.unit,
+            self.range,
+            self.default,
+            self.writing,
+            self.kept.into(),
+            places,
+        ]
+    }
+}
+
+/// The first and the last place of points that share a row: `holding 51 to 58`.
+fn from_to(sharing: &[PointIndex], place: impl Fn(&PointIndex) -> Option<Address>) -> Option<String> {
+    let (first, last) = (place(sharing.first()?)?, place(sharing.last()?)?);
+    if first == last {
+        return Some(first.to_string());
+    }
+    let told = last.to_string();
+    let same_table = format!("{} ", first.span.table());
+    Some(format!("{first} to {}", told.strip_prefix(&same_table).unwrap_or(&told)))
+}
+
+/// What is too long for a cell.
+struct LongTable {
+    /// The points whose cases these are.
+    cases_of: Vec<PointIndex>,
+    /// The points whose names these are; in a table of cases those that decide.
+    names_of: Vec<PointIndex>,
+    rows: String,
+}
+
+impl LongTable {
+    fn all_of(page: &Page<'_>) -> Vec<LongTable> {
+        let mut tables: Vec<LongTable> = Vec::new();
+        let mut table_with = |rows: String| {
+            let known = tables.iter().position(|table| table.rows == rows);
+            known.unwrap_or_else(|| {
+                tables.push(LongTable { cases_of: Vec::new(), names_of: Vec::new(), rows });
+                tables.len() - 1
+            })
+        };
+        let mut cases_of: Vec<(usize, PointIndex)> = Vec::new();
+        let mut names_of: Vec<(usize, PointIndex)> = Vec::new();
+        for (index, point) in page.device.points.iter().enumerate() {
+            if let Encoding::Cases { by, cases } = &point.encoding {
+                let row = |case| {
+                    let (unit, range) = words::case(page.device, case);
+                    format!("| `{}` | {} | {unit} | {} |\n", case.name, case.key, words::cell(&range))
+                };
+                let at = table_with(cases.iter().map(row).collect());
+                cases_of.push((at, index));
+                if !names_of.contains(&(at, *by)) {
+                    names_of.push((at, *by));
+                }
+            }
+        }
+        for (index, point) in page.device.points.iter().enumerate() {
+            let names = point.plain().map_or(&[][..], |form| form.names.list());
+            let stands_with_cases = names_of.iter().any(|(_, known)| *known == index);
+            if names.len() > words::NAMES_IN_CELL && !stands_with_cases {
+                let at =
+                    table_with(names.iter().map(|(raw, name)| format!("| `{name}` | {raw} |\n")).collect());
+                names_of.push((at, index));
+            }
+        }
+        for (at, point) in cases_of {
+            tables[at].cases_of.push(point);
+        }
+        for (at, point) in names_of {
+            tables[at].names_of.push(point);
+        }
+        tables
+    }
+
+    /// The link to the first table that `is_meant`.
+    fn link(tables: &[LongTable], is_meant: impl Fn(&LongTable) -> bool) -> Option<String> {
+        let number = tables.iter().position(is_meant)? + 1;
+        Some(format!("[table {number}](#table-{number})"))
+    }
+
+    fn write(&self, page: &Page<'_>, text: &mut String) {
+        if self.cases_of.is_empty() {
+            let _ = writeln!(
+                text,
+                "What {} can be, and the number in the register.\n\n| Name | In the register |\n|---|---:|",
+                page.names(&self.names_of)
+            );
+        } else {
+            let _ = writeln!(
+                text,
+                "What {} can be, while {} is set as in the first column.{}\n\n\
+                 | Setting | Its number | Unit | Can be |\n|---|---:|---|---|",
+                page.names(&self.cases_of),
+                page.names(&self.names_of),
+                self.about_degrees(page)
+            );
+        }
+        let _ = writeln!(text, "{}", self.rows);
+    }
+
+    /// Ranges of temperatures are told in °C, also where the device can be set to another unit.
+    fn about_degrees(&self, page: &Page<'_>) -> &'static str {
+        let changes = self.cases_of.iter().any(|index| match &page.device.points[*index].encoding {
+            Encoding::Plain(_) => false,
+            Encoding::Cases { cases, .. } => cases
+                .iter()
+                .filter_map(|case| case.form.as_ref())
+                .any(|form| matches!(form.unit, Unit::By(_)) && form.range.is_some()),
+        });
+        if changes { " Ranges of temperatures are given in °C." } else { "" }
+    }
+}
+
+/// The list to look things up in, in the profile's order.
+fn addresses(page: &Page<'_>, text: &mut String) {
+    let _ = writeln!(
+        text,
+        "## Every point and its address\n\nThe name is the one for MQTT and for the configuration. Addresses \
+         count from 0, as on the wire. {}\n\n\
+         | Point | In Home Assistant | Address |\n|---|---|---|",
+        address_words(page)
+    );
+    for (point, entity) in page.device.points.iter().zip(&page.entities) {
+        let shown = entity.as_ref().map_or("", |entity| &entity.name);
+        let _ = writeln!(
+            text,
+            "| `{}` | {} | {} |",
+            point.name,
+            words::cell(shown),
+            words::cell(&words::place(point))
+        );
+    }
+    text.push('\n');
+}
+
+/// The words of an address that this device's points use.
+fn address_words(page: &Page<'_>) -> String {
+    let places = || page.device.points.iter().flat_map(|point| [Some(point.at), point.also]).flatten();
+    let mut parts: Vec<String> = Vec::new();
+    for (table, long) in [
+        (Table::Coil, "Coils"),
+        (Table::Discrete, "Discrete inputs"),
+        (Table::Input, "Input registers"),
+        (Table::Holding, "Holding registers"),
+    ] {
+        if places().any(|place| place.span.table() == table) {
+            parts.push(format!("{long} are read with function {}.", table.read_function()));
+        }
+    }
+    let single_bit = |bits: &Bits| bits.width() == 1;
+    if let Some((place, bit)) = places().find_map(|place| Some((place, place.bits.filter(single_bit)?.low())))
+    {
+        parts.push(format!("`{place}` is bit {bit} of that register, where 0 is the lowest."));
+    }
+    parts.join(" ")
+}

@@ -1,0 +1,331 @@
+//! What a page says of one point, cell by cell, and how it says many things in few words.
+
+use super::super::json::usual_registers;
+use crate::engine::codec::{self, Resolved};
+use crate::engine::device::{
+    Case, Decimals, Device, Encoding, Form, Kind, Names, Platform, Point, PointIndex, Unit, Write, WriteRule,
+};
+use crate::engine::homeassistant::{Entity, entity};
+use crate::engine::time::Duration;
+use crate::engine::value::{Decimal, Missing, Reading};
+
+/// Lists of more names than this get a table of their own.
+pub const NAMES_IN_CELL: usize = 4;
+
+/// What Home Assistant makes of a point while the device is set as it leaves the factory; of a point
+/// that then has no reading, what it makes of it in the first case that has one.
+pub fn entity_of(device: &Device, index: PointIndex) -> Option<Entity> {
+    let usual = usual_registers(device);
+    entity(device, index, &usual).or_else(|| match &device.points[index].encoding {
+        Encoding::Plain(_) => None,
+        Encoding::Cases { by, cases } => cases.iter().find_map(|case| {
+            let mut known = usual.clone();
+            known[*by] = Some(case.key);
+            entity(device, index, &known)
+        }),
+    })
+}
+
+/// A switch, a number: Home Assistant's own word for it, and how several are called.
+pub fn platform(platform: Platform) -> (&'static str, &'static str) {
+    match platform {
+        Platform::Sensor => ("sensor", "Sensors"),
+        Platform::BinarySensor => ("binary sensor", "Binary sensors"),
+        Platform::Switch => ("switch", "Switches"),
+        Platform::Number => ("number", "Numbers"),
+        Platform::Select => ("select", "Selections"),
+        Platform::Button => ("button", "Buttons"),
+        Platform::Text => ("text", "Texts"),
+    }
+}
+
+/// The unit, or the point that tells it.
+pub fn unit(device: &Device, form: &Form) -> String {
+    match &form.unit {
+        Unit::None => String::new(),
+        Unit::Fixed(unit) => unit.clone(),
+        Unit::By(point) => {
+            let point = &device.points[*point];
+            let names = point.plain().map_or(&[][..], |form| form.names.list());
+            let units: Vec<&str> = names.iter().map(|(_, name)| name.as_str()).collect();
+            format!("{}, as `{}` says", units.join(" or "), point.name)
+        }
+    }
+}
+
+/// What it can be: names, a range, a kind of text. `table` is the link to where long lists stand.
+pub fn range(device: &Device, index: PointIndex, form: &Form, table: Option<&str>) -> String {
+    let point = &device.points[index];
+    let rule = point.write.as_ref().map(|write| &write.rule);
+    if matches!(rule, Some(WriteRule::Press { .. })) {
+        return String::new();
+    }
+    let listed = match (table, form.names.list().len()) {
+        (Some(table), _) => table.to_string(),
+        (None, _) => codes(form.names.list().iter().map(|(_, name)| name.as_str())),
+    };
+    let mut parts = Vec::new();
+    match (form.kind, &form.names) {
+        (Kind::Bool, _) => parts.push("`ON`, `OFF`".to_string()),
+        (_, Names::All(_)) => parts.push(listed),
+        (kind, _) if kind.is_text() => parts.push(text(kind)),
+        (_, names) => {
+            parts.extend(numbers(device, index, form, rule));
+            if parts.is_empty() && form.kind.is_float() && rule.is_some() {
+                parts.push("any number".into());
+            }
+            if let Names::Some(_) = names {
+                let or = if parts.is_empty() { "a number, or" } else { "or" };
+                parts.push(format!("{or} {listed}"));
+            }
+        }
+    }
+    if !form.invalid.is_empty() {
+        let reasons: Vec<String> = form.invalid.iter().map(|(_, reason)| reason.replace('_', " ")).collect();
+        parts.push(format!("no value when: {}", reasons.join(", ")));
+    }
+    parts.join("; ")
+}
+
+fn text(kind: Kind) -> String {
+    match kind {
+        Kind::LetterNumber => "a letter and a number, as `R017`".into(),
+        Kind::DayMonthYear => "a date, as `01.01.2018`".into(),
+        kind => format!("text of up to {} characters", 2 * kind.registers()),
+    }
+}
+
+fn numbers(device: &Device, index: PointIndex, form: &Form, rule: Option<&WriteRule>) -> Option<String> {
+    if let Some(Decimals::By(point)) = form.decimals {
+        let dot = format!("`{}` says how many digits stand behind the dot", device.points[point].name);
+        return Some(match rule {
+            Some(WriteRule::Range { min, max, .. }) => format!("{min} to {max} without the dot; {dot}"),
+            _ => dot,
+        });
+    }
+    let resolved = codec::resolve(device, index, &usual_registers(device)).ok()?;
+    match rule.and_then(|rule| codec::limits(&resolved, rule)) {
+        Some(limits) => Some(span_of_numbers(limits.min, limits.max, limits.step)),
+        None => measured(form),
+    }
+}
+
+/// The measuring range of a form and its finest step, as the manual gives it.
+pub fn measured(form: &Form) -> Option<String> {
+    let digits = match form.decimals {
+        Some(Decimals::Fixed(decimals)) => decimals,
+        Some(Decimals::By(_)) | None => 0,
+    };
+    let step = Decimal { units: form.scale.units.abs(), decimals: form.scale.decimals + digits };
+    let step = (!form.kind.is_float()).then_some(step);
+    let (mut min, mut max) = match (form.range, step) {
+        (Some(range), _) => range,
+        (None, Some(step)) if step.compare(Decimal::ONE).is_ne() => return Some(steps(step)),
+        _ => return None,
+    };
+    if form.difference {
+        max = max.checked_add(min.negated())?;
+        min = max.negated();
+    }
+    Some(span_of_numbers(min, max, step))
+}
+
+fn span_of_numbers(min: Decimal, max: Decimal, step: Option<Decimal>) -> String {
+    let span = format!("{} to {}", min.normalized(), max.normalized());
+    match step.filter(|step| step.compare(Decimal::ONE).is_ne()) {
+        Some(step) => format!("{span} {}", steps(step)),
+        None => span,
+    }
+}
+
+fn steps(step: Decimal) -> String {
+    format!("in steps of {}", step.normalized())
+}
+
+/// The factory setting as it is shown.
+pub fn default(device: &Device, index: PointIndex) -> String {
+    let Some(raw) = device.points[index].default else { return String::new() };
+    let shown = codec::resolve(device, index, &usual_registers(device)).ok();
+    match shown.map(|resolved| codec::read(&resolved, &words(&resolved, raw))) {
+        Some(Reading::Missing(Missing::UnknownValue(_) | Missing::NotText | Missing::NotANumber)) | None => {
+            format!("register {raw}")
+        }
+        Some(reading @ (Reading::Name(_) | Reading::Text(_) | Reading::Flag(_))) => format!("`{reading}`"),
+        Some(Reading::Number(number)) => number.normalized().to_string(),
+        Some(reading) => reading.to_string(),
+    }
+}
+
+/// A register field as the words that carry it on the wire.
+fn words(resolved: &Resolved<'_>, raw: i128) -> Vec<u16> {
+    let order = resolved.form.order;
+    let count = u32::from(resolved.form.kind.registers());
+    let mut words: Vec<u16> = (0..count).rev().map(|place| (raw >> (16 * place)) as u16).collect();
+    if order.low_word_first() {
+        words.reverse();
+    }
+    if order.swaps_bytes() {
+        words.iter_mut().for_each(|word| *word = word.swap_bytes());
+    }
+    words
+}
+
+/// Where it stands, in the manual's words.
+pub fn place(point: &Point) -> String {
+    match point.also {
+        Some(also) => format!("{}, also {also}", point.at),
+        None => point.at.to_string(),
+    }
+}
+
+/// Whether it can be written, and how.
+pub fn writing(point: &Point) -> String {
+    let Some(Write { at, with, rule }) = &point.write else { return "no".into() };
+    let mut words = vec![match rule {
+        WriteRule::Any | WriteRule::Range { .. } => "yes".to_string(),
+        WriteRule::Names(names) => format!("only {}", codes(names.iter().map(String::as_str))),
+        WriteRule::Press { .. } => "press".into(),
+    }];
+    if *at != point.at {
+        words.push(format!("at {at}"));
+    }
+    if let Some(function) = with {
+        words.push(format!("with function {} only", function.code()));
+    }
+    words.join(", ")
+}
+
+/// One case of a point that another decides about: its unit and its range.
+pub fn case(device: &Device, case: &Case) -> (String, String) {
+    let Some(form) = &case.form else { return (String::new(), "no value".into()) };
+    let mut range = match (form.kind, &form.names) {
+        (Kind::Bool, _) => "`ON`, `OFF`".into(),
+        (kind, _) if kind.is_text() => text(kind),
+        (_, Names::All(names)) => codes(names.iter().map(|(_, name)| name.as_str())),
+        (_, names) => {
+            let names = codes(names.list().iter().map(|(_, name)| name.as_str()));
+            let or = if names.is_empty() { names } else { format!(", or {names}") };
+            format!("{}{or}", measured(form).unwrap_or_default())
+        }
+    };
+    if let Some(Decimals::By(point)) = form.decimals {
+        range = format!("`{}` says how many digits stand behind the dot", device.points[point].name);
+    }
+    (unit(device, form), range)
+}
+
+/// `ok`, `reset`: names as code, with commas.
+pub fn codes<'n>(names: impl IntoIterator<Item = &'n str>) -> String {
+    names.into_iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ")
+}
+
+/// Names that differ in one number only are told as a range: `relay_1` to `relay_4`.
+pub fn together(names: &[&str]) -> String {
+    folded(names).iter().map(|run| run.told(|name| format!("`{name}`"))).collect::<Vec<_>>().join(", ")
+}
+
+/// The same for what people read: Relay 1 to 4.
+pub fn together_plain(names: &[&str]) -> String {
+    let told = |run: &Run| match (run.names.as_slice(), run.last_number) {
+        ([first, .., _], Some(last)) if first.ends_with(|c: char| c.is_ascii_digit()) => {
+            format!("{first} to {last}")
+        }
+        _ => run.told(str::to_string),
+    };
+    folded(names).iter().map(told).collect::<Vec<_>>().join(", ")
+}
+
+/// Names in a row.
+struct Run<'n> {
+    /// Before and behind the first number.
+    frame: (&'n str, &'n str),
+    names: Vec<&'n str>,
+    last_number: Option<u32>,
+}
+
+impl Run<'_> {
+    fn told(&self, show: impl Fn(&str) -> String) -> String {
+        match self.names.as_slice() {
+            [one] => show(one),
+            [first, second] => format!("{} and {}", show(first), show(second)),
+            [first, .., last] => format!("{} to {}", show(first), show(last)),
+            [] => String::new(),
+        }
+    }
+}
+
+fn folded<'n>(names: &[&'n str]) -> Vec<Run<'n>> {
+    let mut runs: Vec<Run<'n>> = Vec::new();
+    for &name in names {
+        let (frame, number) = around_first_number(name);
+        let follows = |run: &&mut Run| {
+            run.frame == frame && run.last_number.is_some_and(|last| number == last.checked_add(1))
+        };
+        match runs.iter_mut().find(follows) {
+            Some(run) => {
+                run.names.push(name);
+                run.last_number = number;
+            }
+            None => runs.push(Run { frame, names: vec![name], last_number: number }),
+        }
+    }
+    runs
+}
+
+/// What stands before and behind the first number of a name, and that number.
+pub fn around_first_number(name: &str) -> ((&str, &str), Option<u32>) {
+    let is_digit = |c: char| c.is_ascii_digit();
+    let Some(start) = name.find(is_digit) else { return ((name, ""), None) };
+    let rest = &name[start..];
+    let end = start + rest.find(|c| !is_digit(c)).unwrap_or(rest.len());
+    ((&name[..start], &name[end..]), name[start..end].parse().ok())
+}
+
+/// A bar would end the cell.
+pub fn cell(text: &str) -> String {
+    text.replace('|', "\\|")
+}
+
+/// 500 ms, 30 s, 1.5 s.
+pub fn duration(duration: Duration) -> String {
+    let millis = duration.as_millis();
+    if millis < 1000 {
+        format!("{millis} ms")
+    } else {
+        let seconds = Decimal { units: millis as i128, decimals: 3 };
+        format!("{} s", seconds.normalized())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_in_a_row_are_told_as_a_range() {
+        for (names, expected) in [
+            (vec!["watchdog"], "`watchdog`"),
+            (vec!["relay_1", "relay_2"], "`relay_1` and `relay_2`"),
+            (vec!["relay_1", "watchdog", "relay_2", "relay_3"], "`relay_1` to `relay_3`, `watchdog`"),
+            (
+                vec!["a_1_on", "a_1_off", "a_2_on", "a_2_off"],
+                "`a_1_on` and `a_2_on`, `a_1_off` and `a_2_off`",
+            ),
+            (vec!["relay_1", "relay_3"], "`relay_1`, `relay_3`"),
+        ] {
+            assert_eq!(together(&names), expected);
+        }
+        assert_eq!(together_plain(&["Relay 1", "Relay 2", "Relay 3", "Reset"]), "Relay 1 to 3, Reset");
+        assert_eq!(
+            together_plain(&["Meter 1 digits", "Meter 2 digits"]),
+            "Meter 1 digits and Meter 2 digits"
+        );
+    }
+
+    #[test]
+    fn durations_are_told_in_the_unit_that_people_would_use() {
+        for (millis, expected) in [(50, "50 ms"), (1000, "1 s"), (1500, "1.5 s"), (60_000, "60 s")] {
+            assert_eq!(duration(Duration::from_millis(millis)), expected);
+        }
+    }
+}
