@@ -244,7 +244,7 @@ mod tests {
             "fuehlersysteme/relay8",
             &[
                 "it reads input 0 and expects 20480",
-                "* **Buttons.** `relay_1_release` to `relay_8_release`, `release_all`, `restart`:",
+                "* **Buttons act at once** and ask nothing back: `relay_1_release` to `relay_8_release`, `release_all`,",
                 "| An answer is awaited | at least 300 ms; longer if the bus says so |",
                 "| A value out of range | the device takes the nearest",
                 "| Relay 1 to 8 | binary sensor | `ON`, `OFF` |  | no | input 1 to 8, also input 9.0 to 9.7 |",
