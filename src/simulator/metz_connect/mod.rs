@@ -39,13 +39,20 @@ pub trait Module: Send {
     /// A valid message with this device's own address has come, whatever it says.
     fn message_for_this_device(&mut self, _now: Time) {}
 
-    fn advance(&mut self, now: Time);
-    fn restart(&mut self, now: Time);
     fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String>;
-    fn outputs(&self) -> Vec<(String, String)>;
-    fn eeprom(&self) -> Vec<u16>;
+
+    // What follows is only there for modules in which time changes something, or which switch or store.
+
+    fn advance(&mut self, _now: Time) {}
+    fn restart(&mut self, _now: Time) {}
+    fn outputs(&self) -> Vec<(String, String)> {
+        Vec::new()
+    }
+    fn eeprom(&self) -> Vec<u16> {
+        Vec::new()
+    }
     /// Puts back as many words as [`Module::eeprom`] gives.
-    fn load_eeprom(&mut self, words: &[u16]);
+    fn load_eeprom(&mut self, _words: &[u16]) {}
 }
 
 /// A METZ CONNECT device.

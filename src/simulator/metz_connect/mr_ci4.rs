@@ -91,10 +91,6 @@ impl Module for MrCi4 {
         }
     }
 
-    fn advance(&mut self, _now: Time) {}
-
-    fn restart(&mut self, _now: Time) {}
-
     fn stimulate(&mut self, _now: Time, stimulus: &Stimulus) -> Result<(), String> {
         match *stimulus {
             Stimulus::Input { input: input @ 1..=4, signal } => {
@@ -114,16 +110,6 @@ impl Module for MrCi4 {
             _ => Err("MR-CI4 has inputs and DIP switches and nothing else to touch".into()),
         }
     }
-
-    fn outputs(&self) -> Vec<(String, String)> {
-        Vec::new()
-    }
-
-    fn eeprom(&self) -> Vec<u16> {
-        Vec::new()
-    }
-
-    fn load_eeprom(&mut self, _words: &[u16]) {}
 }
 
 #[cfg(test)]

@@ -43,10 +43,6 @@ impl<const INPUTS: usize> Module for MrDi<INPUTS> {
         }
     }
 
-    fn advance(&mut self, _now: Time) {}
-
-    fn restart(&mut self, _now: Time) {}
-
     fn stimulate(&mut self, _now: Time, stimulus: &Stimulus) -> Result<(), String> {
         let Stimulus::Input { input, signal } = *stimulus else {
             return Err(format!("{} has inputs and nothing else to touch", Self::PRODUCT));
@@ -62,16 +58,6 @@ impl<const INPUTS: usize> Module for MrDi<INPUTS> {
         };
         Ok(())
     }
-
-    fn outputs(&self) -> Vec<(String, String)> {
-        Vec::new()
-    }
-
-    fn eeprom(&self) -> Vec<u16> {
-        Vec::new()
-    }
-
-    fn load_eeprom(&mut self, _words: &[u16]) {}
 }
 
 #[cfg(test)]
