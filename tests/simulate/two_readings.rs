@@ -13,11 +13,20 @@ use serde_json::Value;
 use crate::broker::{Broker, Listener};
 
 /// Each device's name in the configuration, its profile, and its unit.
-const DEVICES: [(&str, &str, u8); 4] = [
+const DEVICES: [(&str, &str, u8); 13] = [
     ("relays", "metz-connect/mr-do4", 18),
     ("inputs", "metz-connect/mr-ai8", 19),
     ("meters", "metz-connect/mr-si4", 20),
     ("board", "fuehlersysteme/relay8", 7),
+    ("contacts_4", "metz-connect/mr-di4", 21),
+    ("contacts_10", "metz-connect/mr-di10", 22),
+    ("more_relays", "metz-connect/mr-doa4", 23),
+    ("voltages", "metz-connect/mr-ao4", 24),
+    ("voltages_by_hand", "metz-connect/mr-aop4", 25),
+    ("currents", "metz-connect/mr-ci4", 26),
+    ("triacs", "metz-connect/mr-to4", 27),
+    ("old_inputs", "btr/mr-ai8", 28),
+    ("output_board", "fuehlersysteme/analog-out8", 8),
 ];
 
 #[test]
@@ -79,8 +88,9 @@ fn value_to_write(point: &Value) -> Option<String> {
         if !point["decimals_by"].is_null() {
             return Some("2".into());
         }
-        // The lower threshold's greatest value is bounded by the upper threshold.
-        let is_lower = point["name"].as_str().is_some_and(|name| name.ends_with("off_below"));
+        // A lower threshold's greatest value is bounded by the upper threshold, a zero's by the end.
+        let is_lower = |name: &str| name.ends_with("off_below") || name.ends_with("zero");
+        let is_lower = point["name"].as_str().is_some_and(is_lower);
         let raw = number(if is_lower { "min" } else { "max" });
         return Some(raw.checked_mul(number("scale")).expect("a small number").normalized().to_string());
     }
@@ -88,7 +98,7 @@ fn value_to_write(point: &Value) -> Option<String> {
     if let Some(name) = names.values().next_back() {
         return name.as_str().map(str::to_string);
     }
-    Some(if point["type"] == "letter_number" { "R017" } else { "1.5" }.into())
+    Some(if point["type"] == "letter_number" { "R017" } else { "5" }.into())
 }
 
 fn points(profile: &str) -> Vec<Value> {
