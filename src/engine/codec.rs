@@ -25,6 +25,23 @@ pub struct Resolved<'d> {
     pub case: Option<&'d str>,
 }
 
+impl Resolved<'_> {
+    /// What one more in the register is in the unit; `None` for what is no integer.
+    pub fn step(&self) -> Option<Decimal> {
+        let Form { kind, scale, .. } = self.form;
+        kind.integer_range()?;
+        Some(Decimal { units: scale.units.abs(), decimals: scale.decimals + self.shift })
+    }
+
+    /// As many digits behind the dot as it takes to see one step of the register: 4 for steps of
+    /// 0.0003125 V, of which the exact value has 7.
+    pub fn display_precision(&self) -> Option<u8> {
+        let Some(step) = self.step() else { return self.decimals };
+        let visible = |decimals: &u8| Decimal { units: 1, decimals: *decimals }.compare(step).is_le();
+        self.decimals.map(|exact| (0..exact).find(visible).unwrap_or(exact))
+    }
+}
+
 /// What `point` means at present. Missing says which point it waits for, or that there is no reading.
 pub fn resolve<'d>(
     device: &'d Device,
@@ -284,10 +301,7 @@ pub struct Limits {
 /// without any.
 pub fn limits(resolved: &Resolved<'_>, rule: &WriteRule) -> Option<Limits> {
     let form = resolved.form;
-    let resolution = form
-        .kind
-        .integer_range()
-        .map(|_| Decimal { units: form.scale.units.abs(), decimals: form.scale.decimals + resolved.shift });
+    let resolution = resolved.step();
     match rule {
         WriteRule::Range { min, max, step } => {
             // Where a register gives the decimals, the profile's range is the register's own.

@@ -185,3 +185,18 @@ fn fahrenheit_moves_the_limits_of_values_and_of_differences() {
     temperature.difference = true;
     assert_eq!(limits_of(&temperature), "-360 360");
 }
+
+#[test]
+fn the_digits_shown_are_those_that_one_step_of_the_register_moves() {
+    for (scale, shift, expected) in
+        [("1", 0, 0), ("0.01", 0, 2), ("1", 3, 3), ("0.0003125", 0, 4), ("0.05", 0, 2), ("100", 0, 0)]
+    {
+        let form = with(Kind::I16, |form| {
+            form.scale = decimal(scale);
+            form.decimals = Some(Decimals::Fixed(shift));
+        });
+        let device = device(form, registers(1), WriteRule::Any);
+        let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+        assert_eq!(resolved.display_precision(), Some(expected), "{scale} {shift}");
+    }
+}

@@ -167,8 +167,8 @@ fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Ent
     component.insert("name".into(), name_beside(&entity.name, &device.title));
     let platform = entity.platform;
     component.insert("unique_id".into(), format!("{}_{}", topics.identity(&device.name), entity.key).into());
-    // The point's name without the case: dashboards keep their entity when an input is set to another
-    // sensor, while its history, kept by `unique_id`, starts anew with each unit.
+    // The point's name without the case. When an input is set to a sensor of another unit, a second
+    // entity comes, with a history of its own, and Home Assistant ends its entity id in `_2`.
     let object = if platform == Platform::Button { &entity.key } else { point };
     component
         .insert("default_entity_id".into(), format!("{}.{}_{object}", platform.name(), device.name).into());

@@ -217,7 +217,7 @@ fn describe_number(entity: &mut Entity, point: &Point, resolved: &Resolved) {
             .clone()
             .filter(|wished| units::check(Platform::Sensor, class, unit.as_deref(), Some(wished)).is_ok())
             .or_else(|| derived_state_class(point, resolved, class, unit.as_deref()).map(str::to_string));
-        entity.precision = resolved.decimals;
+        entity.precision = resolved.display_precision();
     } else {
         let limits = point.write.as_ref().and_then(|write| codec::limits(resolved, &write.rule));
         if let Some(limits) = limits {
