@@ -5,7 +5,7 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader};
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex};
@@ -90,27 +90,27 @@ impl Drop for Mosquitto {
     }
 }
 
+/// `None` if the port is taken.
 fn start_mosquitto(folder: &TempDir, port: u16) -> Option<Child> {
     let configuration = folder.path().join("mosquitto.conf");
-    let text = format!("listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\n");
+    let text =
+        format!("listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nlog_dest stderr\n");
     fs::write(&configuration, text).expect("a temporary file can be written");
     // Debian keeps it where only root's PATH leads.
     let path = format!("{}:/usr/sbin:/usr/local/sbin", std::env::var("PATH").unwrap_or_default());
-    let mut child = Command::new("mosquitto")
-        .arg("-c")
-        .arg(configuration)
-        .env("PATH", path)
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("mosquitto is installed; `scripts/get-mosquitto` gets it");
-    let listens = find(|| {
-        if TcpStream::connect(("127.0.0.1", port)).is_ok() {
-            return Some(true);
-        }
-        child.try_wait().expect("a child can be asked").map(|_| false)
-    });
-    if listens == Some(true) { Some(child) } else { None }
+    let mut command = Command::new("mosquitto");
+    command.arg("-c").arg(configuration).env("PATH", path).stdout(Stdio::null()).stderr(Stdio::piped());
+    let mut child = command.spawn().expect("mosquitto is installed; `scripts/get-mosquitto` gets it");
+    let mut log = BufReader::new(child.stderr.take().expect("it is piped")).lines().map_while(Result::ok);
+    // A connection would prove nothing: somebody else's broker may have been faster. Without the
+    // port it ends, and so does its log.
+    let runs = log.any(|line| line.ends_with(" running"));
+    if !runs {
+        end(&mut child);
+        return None;
+    }
+    std::thread::spawn(move || log.for_each(drop));
+    Some(child)
 }
 
 /// The built program, its log kept for the failure message.
