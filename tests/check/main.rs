@@ -73,6 +73,17 @@ fn faults_end_with_exit_code_2_and_begin_with_their_places() {
 }
 
 #[test]
+fn the_last_line_says_what_did_not_happen_only_where_something_was_to_happen() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("busker.yaml");
+    fs::write(&path, GOOD.replace("unit: 18", "unit: 300")).expect("a file");
+    for (verb, last) in [("check", "error: 1 fault"), ("run", "error: 1 fault, nothing was started")] {
+        let output = run(Command::new(env!("CARGO_BIN_EXE_busker")).args([verb, "--config"]).arg(&path));
+        assert_eq!(text(&output.stderr).lines().last(), Some(last), "{verb}");
+    }
+}
+
+#[test]
 fn warnings_do_not_fail() {
     let output = check(&GOOD.replace("/dev/serial/by-id/usb-A", "/dev/ttyUSB0"), &[]);
     assert_eq!(output.status.code(), Some(0));

@@ -28,12 +28,17 @@ pub struct Args {
 }
 
 pub fn run(args: &Args, library: &Library) -> Result<(), Failure> {
+    let count = write_all(&args.output, library)?;
+    output::print(&format!("{count} pages in {}\n", args.output.display()))
+}
+
+fn write_all(folder: &Path, library: &Library) -> Result<usize, Failure> {
     let files = files(library)?;
     for (path, text) in &files {
-        let place = args.output.join(path);
+        let place = folder.join(path);
         write(&place, text).with_context(|| format!("cannot write `{}`", place.display()))?;
     }
-    output::print(&format!("{} pages in {}\n", files.len(), args.output.display()))
+    Ok(files.len())
 }
 
 fn write(place: &Path, text: &str) -> std::io::Result<()> {
@@ -136,14 +141,14 @@ mod tests {
     }
 
     #[test]
-    fn the_verb_writes_them_where_it_is_told_to() {
+    fn the_pages_are_written_where_they_are_wanted() {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let args = Args { output: folder.path().join("pages") };
-        run(&args, &Library::shipped()).expect("they are written");
+        let output = folder.path().join("pages");
+        write_all(&output, &Library::shipped()).expect("they are written");
         let mut there = BTreeSet::new();
-        files_below(&args.output, &mut there);
+        files_below(&output, &mut there);
         for (path, text) in files(&Library::shipped()).expect("good profiles") {
-            let place = args.output.join(path);
+            let place = output.join(path);
             assert_eq!(fs::read_to_string(&place).ok(), Some(text), "{}", place.display());
             assert!(there.remove(&place));
         }

@@ -206,8 +206,8 @@ devices:
         let subject = if kept == 1 { "One setting is" } else { &format!("{kept} settings are") };
         Some(format!(
             "**EEPROM.** {subject} kept in a memory that wears out by being written; the tables mark them. \
-             busker writes them only when the value differs, and when a setting changes again and again, once \
-             a minute. Set them by hand, not from an automation that runs often."
+             busker writes them only when the value differs, and when a setting changes again and again, at \
+             most once a minute. Set them by hand, not from an automation that runs often."
         ))
     }
 
