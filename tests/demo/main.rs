@@ -7,7 +7,7 @@ use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -31,8 +31,11 @@ fn make_demo_shows_live_values_and_its_three_commands_do_what_they_say() {
     let mut demo = Demo::start(&mut command);
     let introduction = demo.introduction();
 
-    for device in DEVICES {
-        demo.wait_for(&format!("{device} is online"), |line| line == format!("{device} online"));
+    // In whatever order they answer.
+    let mut awaited: Vec<String> = DEVICES.iter().map(|device| format!("{device} online")).collect();
+    while !awaited.is_empty() {
+        let online = demo.wait_for("every device online", |line| awaited.iter().any(|other| other == line));
+        awaited.retain(|other| *other != online);
     }
     let health = ureq::get(&introduction.health).call().expect("health is answered");
     assert_eq!(health.status(), 200);
@@ -196,9 +199,11 @@ impl Demo {
     }
 
     /// The next line that fits.
+    #[expect(clippy::disallowed_methods, reason = "other lines come for ever")]
     fn wait_for(&mut self, what: &str, fits: impl Fn(&str) -> bool) -> String {
+        let begun = Instant::now();
         loop {
-            match self.lines.recv_timeout(PATIENCE) {
+            match self.lines.recv_timeout(PATIENCE.saturating_sub(begun.elapsed())) {
                 Ok(line) if fits(&line) => return line,
                 Ok(line) => self.seen.push(line),
                 Err(error) => panic!("{what} did not come ({error}); seen:\n{}", self.seen.join("\n")),
