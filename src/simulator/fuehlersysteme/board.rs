@@ -93,7 +93,12 @@ impl<T: Table> Board<T> {
         }
     }
 
-    fn answer(&mut self, now: Time, pdu: &[u8]) -> Result<(Vec<u8>, Option<Restart>), Vec<u8>> {
+    fn answer(
+        &mut self,
+        now: Time,
+        addressed: Addressed,
+        pdu: &[u8],
+    ) -> Result<(Vec<u8>, Option<Restart>), Vec<u8>> {
         let function = pdu.first().copied().unwrap_or(0);
         let refuse = |exception| exception_reply(function, exception);
         // The four codes of chapter 8. The manual has no word for others: exception 1 is the rule.
@@ -109,7 +114,7 @@ impl<T: Table> Board<T> {
                 check_count(count.into())?;
                 let words =
                     self.read(now, function, first, count).ok_or_else(|| refuse(Exception::Address))?;
-                if function == 4 {
+                if function == 4 && addressed == Addressed::Unit {
                     (first..first + count).for_each(|register| self.table.told(now, register));
                 }
                 Ok((words_reply(function, &words), None))
@@ -247,7 +252,7 @@ fn is_write_only(register: u16) -> bool {
 impl<T: Table> SimulatedDevice for Board<T> {
     fn request(&mut self, now: Time, addressed: Addressed, pdu: &[u8]) -> Option<Vec<u8>> {
         self.advance(now);
-        let reply = match self.answer(now, pdu) {
+        let reply = match self.answer(now, addressed, pdu) {
             Ok((reply, restart)) => {
                 if restart == Some(Restart::Factory) {
                     self.customer_code = CUSTOMER_CODE;

@@ -1,6 +1,6 @@
 //! The board with analog inputs against its manual: requests and replies as bytes.
 
-use crate::simulator::device::Model;
+use crate::simulator::device::{Addressed, Model};
 use crate::simulator::testing::Bench;
 
 fn check(rows: &[(&str, &str)]) {
@@ -213,8 +213,9 @@ fn a_held_input_stays_on_until_one_of_its_two_registers_has_been_read_6_3() {
     };
     pulse(&mut bench, 1);
     pulse(&mut bench, 2);
+    // Neither a read that nobody is told, nor another register, nor a refused request lets go.
+    assert_eq!(bench.send(Addressed::Broadcast, "04 0001 0008"), "silence");
     bench.check(&[
-        // Neither another register nor a refused request lets go.
         ("04 0003 0001", "04 02 0001"),
         ("04 0001 000A", "84 02"),
         ("03 0001 0001", "03 02 2B67"),
