@@ -306,6 +306,26 @@ mod tests {
     }
 
     #[test]
+    fn a_period_begins_with_the_mode_with_another_period_and_with_a_restart_page_12() {
+        let mut bench = Bench::new(Model::MrTo4);
+        // 1 s, of which a tenth, from the start as well.
+        bench.check(&[
+            ("06 000A 0064", "06 000A 0064"),
+            ("06 0006 0064", "06 0006 0064"),
+            ("06 000E 0064", "06 000E 0064"),
+        ]);
+        for begin in ["06 0002 0001", "06 000A 00C8", "06 000A 0064", "08 0001 0000"] {
+            bench.wait(650);
+            bench.check(&[("01 0000 0001", "01 01 00"), (begin, begin), ("01 0000 0001", "01 01 01")]);
+            bench.wait(99);
+            // The same word again changes nothing.
+            bench.check(&[("06 0002 0001", "06 0002 0001"), ("01 0000 0001", "01 01 01")]);
+            bench.wait(101);
+            bench.check(&[("01 0000 0001", "01 01 00")]);
+        }
+    }
+
+    #[test]
     fn a_duration_of_0_or_1000_is_never_and_always_and_a_period_of_0_never_page_12() {
         let mut bench = Bench::new(Model::MrTo4);
         bench.check(&[

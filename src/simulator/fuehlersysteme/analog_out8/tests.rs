@@ -182,6 +182,12 @@ fn the_integral_grows_with_time_and_no_further_than_the_output_6_2() {
     bench.check(&[("04 0001 0001", "04 02 03E8"), ("06 000B 0078", "06 000B 0078")]);
     bench.wait(10_000);
     bench.check(&[("04 0001 0001", "04 02 03AB")]);
+    // Without an I there is no integral, and what it was has been forgotten.
+    bench.check(&[("06 000B 003B", "06 000B 003B"), ("06 003D 0000", "06 003D 0000")]);
+    bench.wait(1000);
+    bench.check(&[("04 0001 0001", "04 02 0001"), ("06 003D 0258", "06 003D 0258")]);
+    bench.wait(1000);
+    bench.check(&[("04 0001 0001", "04 02 0001"), ("06 000B 0078", "06 000B 0078")]);
     // Switched off and on again it begins anew.
     bench.check(&[("06 000A 0000", "06 000A 0000"), ("06 000A 0001", "06 000A 0001")]);
     bench.wait(1000);
