@@ -14,7 +14,7 @@ use support::{Busker, Mosquitto, Observer, wait_for};
 const LIE: u16 = 9999;
 
 /// How long the gateway waits for a reply, and then for a late one, in milliseconds.
-const TIMEOUT: u64 = 250;
+const TIMEOUT: u64 = 500;
 
 /// The counters that a fault may raise; the others follow the polls.
 const FAULTS: [&str; 8] = [
