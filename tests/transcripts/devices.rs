@@ -10,7 +10,8 @@ use busker::engine::settings::{
 use busker::engine::time::Duration;
 use busker::engine::value::Decimal;
 
-/// Reads the header: `device …` lines, and `discovery` or `stop feeding` by themselves.
+/// Reads the header: `device …` lines, and `tcp`, `discovery` or `stop feeding`
+/// by themselves.
 pub fn settings(header: &str) -> Settings {
     let mut devices = Vec::new();
     for line in header.lines() {
@@ -46,9 +47,11 @@ pub fn settings(header: &str) -> Settings {
         on_broker_loss: if says("stop feeding") { OnBrokerLoss::StopFeeding } else { OnBrokerLoss::Keep },
         buses: vec![Bus {
             name: "basement".into(),
-            link: Link::Serial {
-                path: "/dev/null".into(),
-                line: Line { baud: 19200, parity: Parity::Even, stop_bits: 1 },
+            link: if says("tcp") {
+                Link::Tcp { host: "localhost".into(), port: 502 }
+            } else {
+                let line = Line { baud: 19200, parity: Parity::Even, stop_bits: 1 };
+                Link::Serial { path: "/dev/null".into(), line }
             },
             response_timeout: Duration::from_millis(500),
             gap: None,

@@ -23,6 +23,9 @@ use crate::engine::topics::Message;
 use device::{DeviceState, Polled};
 use waiting::{Waiting, WaitingCommands};
 
+/// After so many requests in a row that nobody answers, a TCP connection is made anew.
+const UNANSWERED_UNTIL_RENEWED: u32 = 5;
+
 /// What can happen to a bus.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
@@ -92,6 +95,8 @@ pub struct Bus {
     active: Option<(usize, CommandFlow)>,
     in_flight: Option<InFlight>,
     link_state: LinkState,
+    /// Requests in a row that no device on this link answered.
+    unanswered: u32,
     broker_up: bool,
     counters: Counters,
     load: Load,
@@ -121,7 +126,12 @@ impl Context {
 #[derive(Clone, Debug, PartialEq)]
 enum LinkState {
     Up,
-    Down { reason: Option<String>, attempts: u32 },
+    /// Being closed and opened again because nothing answers on it.
+    Renewing,
+    Down {
+        reason: Option<String>,
+        attempts: u32,
+    },
 }
 
 /// What the request on the wire is for.
@@ -167,6 +177,7 @@ impl Bus {
             active: None,
             in_flight: None,
             link_state: LinkState::Down { reason: None, attempts: 0 },
+            unanswered: 0,
             broker_up: true,
             counters: Counters::default(),
             load: Load::default(),
@@ -223,13 +234,13 @@ impl Bus {
     /// The bus as it is now, for `/health`, `/metrics`, `/api` and `bridge/health`.
     pub fn report(&self, now: Time) -> BusReport {
         let reason = match &self.link_state {
-            LinkState::Up => None,
+            LinkState::Up | LinkState::Renewing => None,
             LinkState::Down { reason, .. } => Some(reason.clone().unwrap_or("not yet open".into())),
         };
         BusReport {
             name: self.name.clone(),
             link: self.link.to_string(),
-            up: self.link_state == LinkState::Up,
+            up: matches!(self.link_state, LinkState::Up | LinkState::Renewing),
             reason,
             counters: self.counters,
             load: self.load.share(now),
@@ -240,12 +251,14 @@ impl Bus {
     // What happened to the link.
 
     fn link_up(&mut self) {
-        if let LinkState::Down { attempts, .. } = self.link_state {
-            if attempts > 0 {
+        match std::mem::replace(&mut self.link_state, LinkState::Up) {
+            // The devices are as silent as they were, and are asked as seldom.
+            LinkState::Renewing => return,
+            LinkState::Down { attempts, .. } if attempts > 0 => {
                 self.context.say(Severity::Info, format!("bus {}: the link is back", self.name));
             }
+            LinkState::Down { .. } | LinkState::Up => {}
         }
-        self.link_state = LinkState::Up;
         for device in &mut self.devices {
             device.reconnect(self.now);
         }
@@ -253,7 +266,7 @@ impl Bus {
 
     fn link_down(&mut self, reason: String) {
         let attempts = match &self.link_state {
-            LinkState::Up => 0,
+            LinkState::Up | LinkState::Renewing => 0,
             LinkState::Down { attempts, .. } => *attempts,
         };
         if attempts == 0 {
@@ -279,7 +292,20 @@ impl Bus {
         let device = &mut self.devices[in_flight.device];
         device.count(self.now, &reply);
         self.load.add(in_flight.sent_at.max(reply.sent_at), self.now);
+        self.unanswered = if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
         self.request_ended(in_flight, reply.result);
+        self.renew_silent_connection();
+    }
+
+    /// A serial server may accept a connection and never pass anything on; only a new one helps. A
+    /// serial port has no such state.
+    fn renew_silent_connection(&mut self) {
+        let is_connection = !matches!(self.link, Link::Serial { .. });
+        if is_connection && self.unanswered >= UNANSWERED_UNTIL_RENEWED && self.link_state == LinkState::Up {
+            self.unanswered = 0;
+            self.link_state = LinkState::Renewing;
+            self.context.actions.push_back(Action::Reopen { after: Duration::ZERO });
+        }
     }
 
     fn request_ended(
