@@ -7,7 +7,7 @@
 
 use std::fmt;
 
-use crate::engine::address::{Address, Span};
+use crate::engine::address::{self, Address, Span};
 use crate::engine::device::{Device, PointIndex, Poll};
 use crate::engine::settings::{Line, Link};
 use crate::engine::time::Duration;
@@ -143,7 +143,7 @@ fn plan_at(device: &Device, places: &[Address], cost: Cost, refused: &[Span]) ->
         let (alone, together): (Vec<_>, Vec<_>) =
             wanted.into_iter().partition(|(index, _)| device.points[*index].read_clears);
         let mut of_class = together_by_span(poll, alone, true);
-        for table in crate::engine::address::Table::ALL {
+        for table in address::Table::ALL {
             let of_table: Vec<_> =
                 together.iter().copied().filter(|(_, address)| address.span.table() == table).collect();
             of_class.extend(cut(device, poll, &of_table, cost, refused));

@@ -4,6 +4,7 @@ mod patience;
 mod telling;
 mod wear;
 
+use crate::engine::address::Span;
 use crate::engine::command::{Outcome, OutcomeKind, words_of};
 use crate::engine::device::{Device, Identify, Point, PointIndex};
 use crate::engine::health::Counters;
@@ -33,7 +34,7 @@ pub(super) struct DeviceState {
     values: Values,
     polls: Polls,
     /// What the device has refused to give in one answer.
-    refused: Vec<crate::engine::address::Span>,
+    refused: Vec<Span>,
     presence: Presence,
     patience: Patience,
     wear: Wear,

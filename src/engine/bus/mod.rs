@@ -14,7 +14,7 @@ use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
 use crate::engine::homeassistant::Gateway;
-use crate::engine::modbus::{Call, Reply, Request, RequestError};
+use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Cost;
 use crate::engine::settings::{Link, OnBrokerLoss, Settings};
 use crate::engine::time::{Duration, Time};
@@ -308,11 +308,7 @@ impl Bus {
         }
     }
 
-    fn request_ended(
-        &mut self,
-        in_flight: InFlight,
-        result: Result<crate::engine::modbus::Answer, RequestError>,
-    ) {
+    fn request_ended(&mut self, in_flight: InFlight, result: Result<Answer, RequestError>) {
         let device = &mut self.devices[in_flight.device];
         match in_flight.purpose {
             Purpose::Identify => device.identified(self.now, result, &mut self.context),
@@ -441,11 +437,7 @@ impl Bus {
         true
     }
 
-    fn command_answered(
-        &mut self,
-        device: usize,
-        result: Result<crate::engine::modbus::Answer, RequestError>,
-    ) {
+    fn command_answered(&mut self, device: usize, result: Result<Answer, RequestError>) {
         let Some((_, mut flow)) = self.active.take() else { return };
         let point = flow.point();
         if let (true, Ok(answer)) = (flow.reads(), &result) {
