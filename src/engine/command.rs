@@ -133,12 +133,7 @@ impl CommandFlow {
         self.point
     }
 
-    pub fn wanted(&self) -> &str {
-        &self.wanted
-    }
-
-    /// The place that is being read, if the question under way is a read of the point's own place: its
-    /// words are news for every point in it.
+    /// Whether the question under way reads the point's place: the answer is news for every point in it.
     pub fn reads(&self) -> bool {
         matches!(self.state, State::ReadingBefore { .. } | State::ReadingBack { .. })
     }

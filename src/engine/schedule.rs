@@ -62,10 +62,6 @@ impl Polls {
         &self.reads[index].read
     }
 
-    pub fn reads(&self) -> impl Iterator<Item = &Read> {
-        self.reads.iter().map(|planned| &planned.read)
-    }
-
     /// The most urgent read that may begin now.
     pub fn most_urgent(&self, now: Time) -> Option<(usize, Urgency)> {
         let mut best: Option<(usize, Urgency)> = None;

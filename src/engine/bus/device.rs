@@ -17,7 +17,7 @@ use crate::engine::state::Values;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::Missing;
 
-use super::{Context, Severity, unit_of};
+use super::{Context, Severity};
 use patience::{FAILURES_UNTIL_OFFLINE, Patience};
 use wear::Wear;
 

@@ -9,7 +9,6 @@ mod waiting;
 
 use std::collections::VecDeque;
 
-use crate::engine::codec;
 use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
@@ -511,9 +510,4 @@ impl Load {
         };
         if time.is_zero() { 0.0 } else { (busy.as_secs_f64() / time.as_secs_f64()).min(1.0) }
     }
-}
-
-/// The unit of a point as it is told now.
-fn unit_of(device: &DeviceState, point: PointIndex) -> Option<String> {
-    codec::resolve(device.device(), point, device.known()).ok().and_then(|resolved| resolved.unit)
 }

@@ -186,6 +186,25 @@ pub struct Reply {
     pub discarded: Discarded,
 }
 
+impl Reply {
+    /// The end of a request that was sent at `sent_at`. `times` are those of the answer's first and last
+    /// byte, if there was one. Takes what was thrown away so far.
+    pub fn new(
+        result: Result<Answer, RequestError>,
+        sent_at: Time,
+        times: Option<(Time, Time)>,
+        discarded: &mut Discarded,
+    ) -> Reply {
+        Reply {
+            result,
+            sent_at,
+            first_byte_at: times.map(|(first, _)| first),
+            last_byte_at: times.map(|(_, last)| last),
+            discarded: std::mem::take(discarded),
+        }
+    }
+}
+
 /// Counts of what a line threw away; each is a hint at a different fault.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Discarded {

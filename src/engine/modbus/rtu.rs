@@ -247,7 +247,7 @@ impl Guard {
             State::Begun { .. } => now,
             State::Waiting(waiting) => waiting.sent_at,
         };
-        Some(self.reply(Err(RequestError::Link(reason.to_owned())), sent_at, None))
+        Some(Reply::new(Err(RequestError::Link(reason.to_owned())), sent_at, None, &mut self.discarded))
     }
 
     /// The reply that can be delivered without waiting longer.
@@ -374,7 +374,7 @@ impl Guard {
         let last = self.heard_at.last().copied();
         self.clear(self.heard.len());
         self.state = State::Idle;
-        self.reply(Err(error), waiting.sent_at, first.zip(last))
+        Reply::new(Err(error), waiting.sent_at, first.zip(last), &mut self.discarded)
     }
 
     fn answered(&mut self, waiting: Waiting, found: Found) -> Reply {
@@ -392,7 +392,7 @@ impl Guard {
         let times = (self.heard_at[found.start], self.heard_at[found.end - 1]);
         self.clear(found.end);
         self.state = State::Idle;
-        self.reply(found.result, waiting.sent_at, Some(times))
+        Reply::new(found.result, waiting.sent_at, Some(times), &mut self.discarded)
     }
 
     /// A broadcast has had its time.
@@ -404,26 +404,11 @@ impl Guard {
         self.forget(&sorted.late);
         self.clear(self.heard.len());
         self.state = State::Idle;
-        self.reply(Ok(Answer::Written), sent_at, None)
+        Reply::new(Ok(Answer::Written), sent_at, None, &mut self.discarded)
     }
 
     fn impossible(&mut self, now: Time, reason: &'static str) -> Reply {
-        self.reply(Err(RequestError::Impossible(reason)), now, None)
-    }
-
-    fn reply(
-        &mut self,
-        result: Result<Answer, RequestError>,
-        sent_at: Time,
-        times: Option<(Time, Time)>,
-    ) -> Reply {
-        Reply {
-            result,
-            sent_at,
-            first_byte_at: times.map(|(first, _)| first),
-            last_byte_at: times.map(|(_, last)| last),
-            discarded: std::mem::take(&mut self.discarded),
-        }
+        Reply::new(Err(RequestError::Impossible(reason)), now, None, &mut self.discarded)
     }
 
     /// Between requests: a late reply ends the quarantine that waits for it.

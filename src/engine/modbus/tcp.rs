@@ -49,11 +49,18 @@ impl Guard {
 
     pub fn begin(&mut self, now: Time, request: &Request, timeout: Duration) -> Option<Reply> {
         if let Some(reason) = self.broken {
-            return Some(self.reply(Err(RequestError::Link(reason.into())), now, None));
+            return Some(Reply::new(Err(RequestError::Link(reason.into())), now, None, &mut self.discarded));
         }
         let pdu = match pdu::encode(&request.call) {
             Ok(pdu) => pdu,
-            Err(reason) => return Some(self.reply(Err(RequestError::Impossible(reason)), now, None)),
+            Err(reason) => {
+                return Some(Reply::new(
+                    Err(RequestError::Impossible(reason)),
+                    now,
+                    None,
+                    &mut self.discarded,
+                ));
+            }
         };
         self.transaction = self.transaction.wrapping_add(1);
         self.frame.clear();
@@ -114,7 +121,7 @@ impl Guard {
             self.unanswered.pop_front();
         }
         self.unanswered.push_back(self.transaction);
-        Some(self.reply(Err(RequestError::Timeout), sent_at, None))
+        Some(Reply::new(Err(RequestError::Timeout), sent_at, None, &mut self.discarded))
     }
 
     pub fn link_lost(&mut self, now: Time, reason: &str) -> Option<Reply> {
@@ -127,7 +134,7 @@ impl Guard {
             State::Begun { .. } => now,
             State::Waiting { sent_at, .. } => sent_at,
         };
-        Some(self.reply(Err(RequestError::Link(reason.to_owned())), sent_at, None))
+        Some(Reply::new(Err(RequestError::Link(reason.to_owned())), sent_at, None, &mut self.discarded))
     }
 
     /// The next whole frame, or why there will be none.
@@ -167,22 +174,7 @@ impl Guard {
         };
         self.discarded.foreign_frames += u32::from(result == Err(RequestError::WrongFrame));
         self.state = State::Idle;
-        Some(self.reply(result, sent_at, Some((first_byte_at, now))))
-    }
-
-    fn reply(
-        &mut self,
-        result: Result<crate::engine::modbus::Answer, RequestError>,
-        sent_at: Time,
-        times: Option<(Time, Time)>,
-    ) -> Reply {
-        Reply {
-            result,
-            sent_at,
-            first_byte_at: times.map(|(first, _)| first),
-            last_byte_at: times.map(|(_, last)| last),
-            discarded: std::mem::take(&mut self.discarded),
-        }
+        Some(Reply::new(result, sent_at, Some((first_byte_at, now)), &mut self.discarded))
     }
 }
 

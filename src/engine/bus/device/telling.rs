@@ -3,6 +3,7 @@
 
 use serde_json::json;
 
+use crate::engine::codec;
 use crate::engine::device::PointIndex;
 use crate::engine::health::{DeviceReport, PointReport};
 use crate::engine::homeassistant;
@@ -10,7 +11,7 @@ use crate::engine::time::Time;
 use crate::engine::topics::{Message, OFFLINE, ONLINE};
 use crate::engine::value::Reading;
 
-use super::{Context, DeviceState, Presence, unit_of};
+use super::{Context, DeviceState, Presence};
 
 impl DeviceState {
     pub(super) fn tell_all(&mut self, now: Time, context: &mut Context) {
@@ -120,7 +121,7 @@ impl DeviceState {
                 .map(|(index, point)| PointReport {
                     name: point.name.clone(),
                     value: self.values.reading(index).to_string(),
-                    unit: unit_of(self, index),
+                    unit: self.unit_of(index),
                     reason: match self.values.reading(index) {
                         Reading::Missing(missing) => Some(missing.to_string()),
                         _ => None,
@@ -129,5 +130,10 @@ impl DeviceState {
                 })
                 .collect(),
         }
+    }
+
+    /// The unit of a point as it is told now.
+    fn unit_of(&self, point: PointIndex) -> Option<String> {
+        codec::resolve(self.device(), point, self.known()).ok().and_then(|resolved| resolved.unit)
     }
 }
