@@ -8,7 +8,7 @@
 
 use crate::engine::address::Address;
 use crate::engine::device::{
-    Case, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Unit, WriteRule,
+    Case, Condition, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Unit, WriteRule,
 };
 use crate::engine::value::{Decimal, Missing, Reading};
 
@@ -48,6 +48,9 @@ pub fn resolve<'d>(
     point: PointIndex,
     known: &[Option<i128>],
 ) -> Result<Resolved<'d>, Missing> {
+    if !lives(device, &device.points[point].when, known)? {
+        return Err(Missing::NotInThisMode);
+    }
     match &device.points[point].encoding {
         Encoding::Plain(form) => resolve_form(device, form, None, known),
         Encoding::Cases { by, cases } => {
@@ -56,6 +59,16 @@ pub fn resolve<'d>(
             resolve_form(device, form, Some(&case.name), known)
         }
     }
+}
+
+/// Whether all of `conditions` hold. Missing says which point it waits for.
+pub fn lives(device: &Device, conditions: &[Condition], known: &[Option<i128>]) -> Result<bool, Missing> {
+    for condition in conditions {
+        if !condition.holds(known_value(device, condition.point, known)?) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
 }
 
 fn active_case<'d>(
@@ -215,6 +228,15 @@ fn most_significant_first(form: &Form, words: &[u16]) -> Vec<u16> {
 
 /// What the words (from [`words_at`]) say.
 pub fn read(resolved: &Resolved<'_>, words: &[u16]) -> Reading {
+    let Form { kind, elements, .. } = *resolved.form;
+    if elements > 1 {
+        let each = words.chunks_exact(usize::from(kind.registers()));
+        return Reading::List(each.take(elements.into()).map(|words| read_one(resolved, words)).collect());
+    }
+    read_one(resolved, words)
+}
+
+fn read_one(resolved: &Resolved<'_>, words: &[u16]) -> Reading {
     let form = resolved.form;
     let raw = raw(form, words);
     if let Some(reason) = invalid_reason(form, words, &raw) {

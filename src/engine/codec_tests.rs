@@ -17,7 +17,7 @@ fn words(hex: &str) -> Vec<u16> {
 fn device(form: Form, at: Address, rule: WriteRule) -> Device {
     let mut point = Point::new("point", at, Poll::Fast);
     point.encoding = Encoding::Plain(form);
-    point.write = Some(Write { at, with: None, rule });
+    point.write = Some(Write::new(at, rule));
     device_of(vec![point])
 }
 

@@ -2,6 +2,10 @@
 //!
 //! Nothing here is serialized. What a profile's author typed is `profile::file`; what is true is here.
 
+mod thing;
+
+pub use thing::{PRESS, State, Thing, ThingCommand, ThingKind};
+
 use crate::engine::address::{Address, Span};
 use crate::engine::time::Duration;
 use crate::engine::value::Decimal;
@@ -22,6 +26,8 @@ pub struct Device {
     pub wire: Wire,
     /// In the profile's order, repetitions one after the other.
     pub points: Vec<Point>,
+    /// Made of points; empty for most devices.
+    pub things: Vec<Thing>,
     pub left_out: Vec<LeftOut>,
 }
 
@@ -125,7 +131,16 @@ pub struct Point {
     pub also: Option<Address>,
     pub encoding: Encoding,
     pub poll: Poll,
+    /// It lives only while all of these hold; empty: always.
+    pub when: Vec<Condition>,
     pub write: Option<Write>,
+    /// The point with the longest time between two writes of this one, in its unit; 0 there: any. What
+    /// the register holds is written to it again in time.
+    pub heartbeat: Option<PointIndex>,
+    /// It holds the number of a register of this span; what is by it is understood as the point there.
+    pub refers: Option<Span>,
+    /// Each flip of this bit is an event of this type; the bit itself is not told.
+    pub event: Option<String>,
     /// In EEPROM: written only if it differs, seldom, and counted.
     pub persistent: bool,
     /// Reading it changes the device; it travels alone.
@@ -150,7 +165,11 @@ impl Point {
             also: None,
             encoding: Encoding::Plain(Form::new(kind)),
             poll,
+            when: Vec::new(),
             write: None,
+            heartbeat: None,
+            refers: None,
+            event: None,
             persistent: false,
             read_clears: false,
             default: None,
@@ -160,9 +179,19 @@ impl Point {
         }
     }
 
-    /// Whether the gateway reads this point at all.
+    /// Whether the gateway reads this point at all by itself.
     pub fn is_read(&self) -> bool {
         self.poll != Poll::Never
+    }
+
+    /// Whether it is read only when somebody asks for it.
+    pub fn is_read_on_request(&self) -> bool {
+        self.poll == Poll::Never && !self.is_button()
+    }
+
+    /// Whether there is nothing to read.
+    pub fn is_button(&self) -> bool {
+        self.write.as_ref().is_some_and(|write| matches!(write.rule, WriteRule::Press { .. }))
     }
 
     /// The one interpretation, for a point without cases.
@@ -191,9 +220,24 @@ impl Point {
                 selectors.push(*by);
             }
         }
+        selectors.extend(self.when.iter().map(|condition| condition.point));
         selectors.sort_unstable();
         selectors.dedup();
         selectors
+    }
+}
+
+/// That a point, whose names decide, holds one of these values.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Condition {
+    pub point: PointIndex,
+    /// Register values with their names.
+    pub values: Vec<(i128, String)>,
+}
+
+impl Condition {
+    pub fn holds(&self, raw: i128) -> bool {
+        self.values.iter().any(|(value, _)| *value == raw)
     }
 }
 
@@ -245,6 +289,8 @@ pub struct Case {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Form {
     pub kind: Kind,
+    /// How many values of this kind stand one behind the other: 1, or the length of an array.
+    pub elements: u16,
     pub order: Order,
     /// value = register × scale ÷ 10^decimals + offset
     pub scale: Decimal,
@@ -266,6 +312,7 @@ impl Form {
     pub fn new(kind: Kind) -> Form {
         Form {
             kind,
+            elements: 1,
             order: Order::Abcd,
             scale: Decimal::ONE,
             offset: Decimal::ZERO,
@@ -435,6 +482,16 @@ pub struct Write {
     /// 16 for several.
     pub with: Option<WriteFunction>,
     pub rule: WriteRule,
+    /// So long the device needs until what was written can be read back.
+    pub settle: Duration,
+    /// The device acts only when the content changes: this register value stands between two equal ones.
+    pub on_change: Option<i128>,
+}
+
+impl Write {
+    pub fn new(at: Address, rule: WriteRule) -> Write {
+        Write { at, with: None, rule, settle: Duration::ZERO, on_change: None }
+    }
 }
 
 /// The four function codes that write.
@@ -484,7 +541,7 @@ pub struct Presentation {
     pub enabled: Option<bool>,
 }
 
-/// Home Assistant's platforms that a single point can be.
+/// Home Assistant's platforms: those that a single point can be, and those of things.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Platform {
     Sensor,
@@ -494,10 +551,14 @@ pub enum Platform {
     Select,
     Button,
     Text,
+    Event,
+    Cover,
+    Valve,
+    Climate,
 }
 
 impl Platform {
-    pub const ALL: [Platform; 7] = [
+    pub const ALL: [Platform; 11] = [
         Platform::Sensor,
         Platform::BinarySensor,
         Platform::Switch,
@@ -505,6 +566,10 @@ impl Platform {
         Platform::Select,
         Platform::Button,
         Platform::Text,
+        Platform::Event,
+        Platform::Cover,
+        Platform::Valve,
+        Platform::Climate,
     ];
 
     pub const fn name(self) -> &'static str {
@@ -516,6 +581,10 @@ impl Platform {
             Platform::Select => "select",
             Platform::Button => "button",
             Platform::Text => "text",
+            Platform::Event => "event",
+            Platform::Cover => "cover",
+            Platform::Valve => "valve",
+            Platform::Climate => "climate",
         }
     }
 }

@@ -13,6 +13,7 @@ pub fn platforms(point: &Point, form: &Form) -> &'static [Platform] {
     let rule = point.write.as_ref().map(|write| &write.rule);
     let enumeration = matches!(form.names, Names::All(_));
     match rule {
+        _ if point.event.is_some() => &[Platform::Event],
         Some(WriteRule::Press { .. }) => &[Platform::Button],
         None if form.kind == Kind::Bool => &[Platform::BinarySensor],
         None => &[Platform::Sensor],
@@ -164,7 +165,10 @@ fn classes(platform: Platform) -> Classes {
         Platform::BinarySensor => Classes::Plain(BINARY_SENSOR_CLASSES),
         Platform::Switch => Classes::Plain(&["outlet", "switch"]),
         Platform::Button => Classes::Plain(&["identify", "restart", "update"]),
-        Platform::Select | Platform::Text => Classes::Plain(&[]),
+        Platform::Event => Classes::Plain(&["button", "doorbell", "motion"]),
+        Platform::Cover => Classes::Plain(COVER_CLASSES),
+        Platform::Valve => Classes::Plain(&["gas", "water"]),
+        Platform::Select | Platform::Text | Platform::Climate => Classes::Plain(&[]),
     }
 }
 
@@ -227,6 +231,9 @@ const UNAMBIGUOUS: &[&str] = &[
     "volume_flow_rate",
     "weight",
 ];
+
+const COVER_CLASSES: &[&str] =
+    &["awning", "blind", "curtain", "damper", "door", "garage", "gate", "shade", "shutter", "window"];
 
 const BINARY_SENSOR_CLASSES: &[&str] = &[
     "battery",

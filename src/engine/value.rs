@@ -149,6 +149,8 @@ pub enum Reading {
     /// A named value: `automatic`, `°C`.
     Name(String),
     Text(String),
+    /// An array of numbers, some of which may be missing.
+    List(Vec<Reading>),
     Missing(Missing),
 }
 
@@ -192,7 +194,7 @@ impl fmt::Display for Missing {
 }
 
 impl fmt::Display for Reading {
-    /// The text published on MQTT: `21.5`, `ON`, `automatic`, `None`.
+    /// The text published on MQTT: `21.5`, `ON`, `automatic`, `[0.1,null]`, `None`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Reading::Number(number) => write!(f, "{number}"),
@@ -201,6 +203,17 @@ impl fmt::Display for Reading {
             Reading::Flag(false) => write!(f, "OFF"),
             Reading::Name(name) => write!(f, "{name}"),
             Reading::Text(text) => write!(f, "{text}"),
+            Reading::List(readings) => {
+                write!(f, "[")?;
+                for (at, reading) in readings.iter().enumerate() {
+                    let comma = if at == 0 { "" } else { "," };
+                    match reading {
+                        Reading::Missing(_) => write!(f, "{comma}null")?,
+                        reading => write!(f, "{comma}{reading}")?,
+                    }
+                }
+                write!(f, "]")
+            }
             Reading::Missing(_) => write!(f, "None"),
         }
     }

@@ -170,7 +170,7 @@ fn formed(mut point: Point, form: Form) -> Point {
 }
 
 fn writable(mut point: Point, rule: WriteRule) -> Point {
-    point.write = Some(Write { at: point.at, with: None, rule });
+    point.write = Some(Write::new(point.at, rule));
     point
 }
 

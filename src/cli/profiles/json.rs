@@ -5,7 +5,8 @@ use serde_json::{Map, Value as Json, json};
 use super::access;
 use crate::engine::address::Span;
 use crate::engine::device::{
-    Case, Decimals, Device, Encoding, Form, Identify, Kind, Order, Point, PointIndex, Unit, WriteRule,
+    Case, Condition, Decimals, Device, Encoding, Form, Identify, Kind, Order, Point, PointIndex, Thing, Unit,
+    WriteRule,
 };
 use crate::engine::homeassistant::entity;
 use crate::engine::value::Decimal;
@@ -54,7 +55,7 @@ pub fn device(device: &Device) -> Json {
         },
         "watchdog": wire.watchdog.map(|point| name(device, point)),
         "points": points,
-        "things": [],
+        "things": device.things.iter().map(|thing| thing_json(device, thing)).collect::<Vec<_>>(),
     })
 }
 
@@ -101,7 +102,7 @@ fn point(device: &Device, index: PointIndex) -> Json {
         "table": point.at.span.table().name(),
         "address": point.at.span.first(),
         "count": point.at.span.count(),
-        "elements": 1,
+        "elements": plain.map_or(1, |form| form.elements),
         "bits": point.at.bits.map(|bits| [bits.low(), bits.high()]),
         "also": point.also.map(|also| json!({
             "table": also.span.table().name(),
@@ -137,19 +138,65 @@ fn point(device: &Device, index: PointIndex) -> Json {
         "values": values(&point.encoding),
         "invalid": invalid(&point.encoding),
         "re_read": point.re_read.iter().map(|other| name(device, *other)).collect::<Vec<_>>(),
-        "by": match &point.encoding {
-            Encoding::Plain(_) => None,
-            Encoding::Cases { by, .. } => Some(name(device, *by)),
-        },
-        "like": null,
+        "by": selector(device, point).filter(|by| by.refers.is_none()).map(|by| &by.name),
+        "like": selector(device, point).filter(|by| by.refers.is_some()).map(|by| &by.name),
+        "refers": point.refers.map(span),
         "cases": match &point.encoding {
             Encoding::Plain(_) => Json::Null,
             Encoding::Cases { cases, .. } => {
                 cases.iter().map(|case| (case.name.clone(), case_json(device, case))).collect::<Map<_, _>>().into()
             }
         },
-        "when": null,
+        "when": when(device, &point.when),
+        "event": point.event,
+        "heartbeat": point.heartbeat.map(|time| name(device, time)),
+        "settle_ms": write.map(|write| write.settle.as_millis() as u64),
+        "on_change": write.and_then(|write| write.on_change).map(|between| number(Decimal::integer(between))),
         "entity": entity_json(device, index),
+    })
+}
+
+/// The point that decides about this one's meaning.
+fn selector<'d>(device: &'d Device, point: &Point) -> Option<&'d Point> {
+    match &point.encoding {
+        Encoding::Plain(_) => None,
+        Encoding::Cases { by, .. } => Some(&device.points[*by]),
+    }
+}
+
+fn when(device: &Device, conditions: &[Condition]) -> Json {
+    if conditions.is_empty() {
+        return Json::Null;
+    }
+    let entry = |condition: &Condition| {
+        let names: Vec<&str> = condition.values.iter().map(|(_, name)| name.as_str()).collect();
+        (name(device, condition.point).to_string(), Json::from(names))
+    };
+    conditions.iter().map(entry).collect::<Map<_, _>>().into()
+}
+
+fn thing_json(device: &Device, thing: &Thing) -> Json {
+    let row = |row: &[(PointIndex, String)]| {
+        let entry = |(point, text): &(PointIndex, String)| {
+            (name(device, *point).to_string(), Json::from(text.as_str()))
+        };
+        Json::from(row.iter().map(entry).collect::<Map<_, _>>())
+    };
+    let states = thing.states.iter().map(|state| (state.name.clone(), row(&state.row)));
+    let commands = thing.commands.iter().map(|command| {
+        let orders: Vec<Json> = command.orders.iter().map(|order| row(std::slice::from_ref(order))).collect();
+        (command.name.clone(), Json::from(orders))
+    });
+    json!({
+        "name": thing.name,
+        "as": thing.kind.name(),
+        "when": when(device, &thing.when),
+        "state": states.collect::<Map<_, _>>(),
+        "do": commands.collect::<Map<_, _>>(),
+        "temperature": thing.temperature.map(|point| name(device, point)),
+        "target": thing.target.map(|point| name(device, point)),
+        "device_class": thing.presentation.device_class,
+        "enabled": thing.presentation.enabled.unwrap_or(true),
     })
 }
 
@@ -174,7 +221,7 @@ fn case_json(device: &Device, case: &Case) -> Json {
 /// What Home Assistant shows, whatever the registers that decide hold. Of a point with cases: what
 /// all of its cases agree in.
 fn entity_json(device: &Device, index: PointIndex) -> Json {
-    let usual = usual_registers(device);
+    let usual = usual_registers(device, index);
     let all: Vec<Json> = match &device.points[index].encoding {
         Encoding::Plain(_) => {
             entity(device, index, &usual).into_iter().map(|entity| entity.to_json()).collect()
@@ -201,13 +248,20 @@ fn entity_json(device: &Device, index: PointIndex) -> Json {
 }
 
 /// What the registers that decide about others hold while nobody has changed them: the factory
-/// setting, or else the first that the profile names.
-pub fn usual_registers(device: &Device) -> Vec<Option<i128>> {
+/// setting, or else the first that the profile names; and whatever lets this point live.
+pub fn usual_registers(device: &Device, index: PointIndex) -> Vec<Option<i128>> {
     let usual = |point: &Point| {
         let named = point.plain().and_then(|form| form.names.list().first()).map(|(raw, _)| *raw);
         Some(point.default.or(named).unwrap_or(0))
     };
-    device.points.iter().map(usual).collect()
+    let mut registers: Vec<Option<i128>> = device.points.iter().map(usual).collect();
+    for condition in &device.points[index].when {
+        let holds = registers[condition.point].is_some_and(|raw| condition.holds(raw));
+        if let (false, Some((raw, _))) = (holds, condition.values.first()) {
+            registers[condition.point] = Some(*raw);
+        }
+    }
+    registers
 }
 
 fn point_is_difference(encoding: &Encoding) -> bool {

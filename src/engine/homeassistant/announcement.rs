@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::{Map, Value, json};
 
 use super::entity::{Entity, companions, entity, sentence};
+use super::thing::thing_component;
 use crate::engine::device::Platform;
 use crate::engine::settings::{self, DeviceSettings};
 use crate::engine::topics::{self, Message, Topics};
@@ -151,6 +152,11 @@ pub fn announcement(
             components.push((entity.key.clone(), component(topics, device, &point.name, &entity)));
         }
     }
+    for thing in &device.device.things {
+        if let Some(component) = thing_component(topics, device, thing, known) {
+            components.push((thing.name.clone(), component));
+        }
+    }
     let about = json!({
         "identifiers": [identity],
         "name": device.title,
@@ -175,7 +181,7 @@ fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Ent
     if platform != Platform::Button {
         component.insert("state_topic".into(), topics.state(&device.name, point).into());
     }
-    if !matches!(platform, Platform::Sensor | Platform::BinarySensor) {
+    if !matches!(platform, Platform::Sensor | Platform::BinarySensor | Platform::Event) {
         component.insert("command_topic".into(), topics.set(&device.name, point).into());
     }
     component
@@ -183,7 +189,7 @@ fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Ent
 
 /// The entity's name without the device's in front, which Home Assistant puts there itself; null for
 /// an entity that is called as its device.
-fn name_beside(name: &str, title: &str) -> Value {
+pub(super) fn name_beside(name: &str, title: &str) -> Value {
     let begins_so = name.get(..title.len()).is_some_and(|start| start.eq_ignore_ascii_case(title));
     match name.get(title.len()..) {
         Some("") if begins_so => Value::Null,
@@ -216,7 +222,7 @@ mod tests {
     fn device() -> DeviceSettings {
         let at = |table, first| Address { span: Span::single(table, first), bits: None };
         let mut relay = Point::new("relay", at(Table::Coil, 0), Poll::Fast);
-        relay.write = Some(Write { at: relay.at, with: None, rule: WriteRule::Any });
+        relay.write = Some(Write::new(relay.at, WriteRule::Any));
         relay.presentation.name = Some("Heating relay".into());
         let mode = Point::new("mode", at(Table::Holding, 0), Poll::Slow);
         let mut input = Point::new("input", at(Table::Input, 0), Poll::Fast);

@@ -3,6 +3,7 @@
 
 use serde_json::{Map, Number, Value, json};
 
+use super::thing;
 use crate::engine::codec::{self, Resolved};
 use crate::engine::device::{
     Category, Device, Encoding, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
@@ -29,6 +30,8 @@ pub struct Entity {
     pub precision: Option<u8>,
     /// The names that a select or an enumeration can have.
     pub options: Vec<String>,
+    /// What an event can be.
+    pub event_types: Vec<String>,
     /// Of a number.
     pub min: Option<Decimal>,
     pub max: Option<Decimal>,
@@ -81,6 +84,7 @@ impl Entity {
         put("icon", self.icon.clone().map(Value::from));
         put("enabled_by_default", (!self.enabled).then(|| false.into()));
         put("options", (!self.options.is_empty()).then(|| self.options.clone().into()));
+        put("event_types", (!self.event_types.is_empty()).then(|| self.event_types.clone().into()));
         if self.platform == Platform::Number {
             // Home Assistant's own limits are 0 and 100, and its finest step is 0.001.
             put("min", Some(self.min.map_or_else(|| json!(f64::from(f32::MIN)), number)));
@@ -101,13 +105,18 @@ impl Entity {
 /// case without a reading.
 pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Option<Entity> {
     let resolved = codec::resolve(device, point, known).ok()?;
-    let point = &device.points[point];
+    let shown = thing::as_shown(device, point, known)?;
+    let point = &*shown;
+    // An array is no state that Home Assistant could keep.
+    if resolved.form.elements > 1 {
+        return None;
+    }
     let platforms = units::platforms(point, resolved.form);
     let platform = point.presentation.platform.filter(|wished| platforms.contains(wished));
     let platform = platform.unwrap_or(platforms[0]);
     let presentation = &point.presentation;
     let mut entity = Entity {
-        key: key(point, &resolved),
+        key: format!("{}{}", key(point, &resolved), shown.key_ending()),
         platform,
         name: presentation.name.clone().unwrap_or_else(|| sentence(&point.name)),
         device_class: None,
@@ -118,6 +127,7 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
         enabled: presentation.enabled.unwrap_or(point.is_read() || point.write.is_some()),
         precision: None,
         options: Vec::new(),
+        event_types: Vec::new(),
         min: None,
         max: None,
         step: None,
@@ -138,6 +148,7 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
         entity.device_class = (platform == Platform::Sensor).then(|| "enum".into());
     } else {
         entity.device_class = fitting_class(point, platform, None);
+        entity.event_types = point.event.iter().cloned().collect();
         if platform == Platform::Text {
             entity.length = Some(match resolved.form.kind {
                 Kind::Text { registers } => registers.saturating_mul(2),
@@ -151,8 +162,9 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
 
 /// Whether enough is known to say which entities there are: no point waits for another one.
 pub fn is_settled(device: &Device, known: &[Option<i128>]) -> bool {
-    (0..device.points.len())
-        .all(|point| !matches!(codec::resolve(device, point, known), Err(Missing::WaitingFor(_))))
+    let points = (0..device.points.len()).map(|point| codec::resolve(device, point, known).map(|_| true));
+    let things = device.things.iter().map(|thing| codec::lives(device, &thing.when, known));
+    points.chain(things).all(|decided| !matches!(decided, Err(Missing::WaitingFor(_))))
 }
 
 /// The buttons that stand beside an entity: one for each name that can be written to the point and
@@ -162,7 +174,9 @@ pub fn companions(device: &Device, index: PointIndex, known: &[Option<i128>]) ->
     else {
         return Vec::new();
     };
-    let point = &device.points[index];
+    // What a thing commands has no controls of its own.
+    let Some(shown) = thing::as_shown(device, index, known) else { return Vec::new() };
+    let point = &*shown;
     let names: Vec<&str> = match (point.write.as_ref().map(|write| &write.rule), main.platform) {
         (Some(WriteRule::Names(names)), Platform::Sensor | Platform::BinarySensor) => {
             names.iter().map(String::as_str).collect()
@@ -192,6 +206,7 @@ fn button_beside(device: &Device, point: &Point, main: &Entity, name: &str) -> E
         enabled: main.enabled,
         precision: None,
         options: Vec::new(),
+        event_types: Vec::new(),
         min: None,
         max: None,
         step: None,
@@ -258,7 +273,7 @@ fn fitting_class(point: &Point, platform: Platform, unit: Option<&str>) -> Optio
 }
 
 fn category(point: &Point, platform: Platform) -> Option<Category> {
-    let reads_only = matches!(platform, Platform::Sensor | Platform::BinarySensor);
+    let reads_only = matches!(platform, Platform::Sensor | Platform::BinarySensor | Platform::Event);
     let category = point.presentation.category.or(if point.persistent {
         Some(Category::Config)
     } else if reads_only && point.poll == Poll::Once {
@@ -333,7 +348,7 @@ mod tests {
         let at = Address { span: Span::single(table, 0), bits: None };
         let mut point = Point::new("flow_value", at, Poll::Slow);
         point.encoding = Encoding::Plain(form);
-        point.write = rule.map(|rule| Write { at, with: None, rule });
+        point.write = rule.map(|rule| Write::new(at, rule));
         change(&mut point);
         point
     }

@@ -1,12 +1,13 @@
 //! Devices as Home Assistant is told of them: a function of the device and of what its selectors
 //! say, never of values.
 //!
-//! `entity` derives what one point is there, `announcement` puts the entities of a device into its
+//! `entity` derives what one point is there, `thing` what several are together, `announcement` puts the entities of a device into its
 //! one discovery message, `gateway` does the same for the gateway itself and its buses.
 
 mod announcement;
 mod entity;
 mod gateway;
+mod thing;
 
 pub use announcement::{Announcement, Gateway, announcement, farewell};
 pub use entity::{Entity, companions, entity, is_settled};

@@ -199,6 +199,11 @@ impl<'f> Expansion<'_, 'f> {
                 .get(file)
                 .map_or(1, |cases| cases.iter().map(|(_, case)| of_form(&case.form)).max().unwrap_or(1)),
         };
+        let elements = point.count.as_ref().map_or(1, |count| count.value.max(1));
+        let Some(widest) = widest.checked_mul(elements) else {
+            self.faults.add(&at.place, format!("{elements} values have no room in 65536 registers"));
+            return widest;
+        };
         match &point.width {
             None => widest,
             Some(width) if width.value < widest => {

@@ -3,7 +3,7 @@
 use serde_json::{Value as Json, json};
 
 use crate::engine::address::{Address, Span};
-use crate::engine::device::{Category, Kind, Order, Platform, Poll, WriteFunction};
+use crate::engine::device::{Category, Kind, Order, Platform, Poll, ThingKind, WriteFunction};
 use crate::engine::profile::text::{Digits, Name, PointPath, Quirk, Range, Repeat, Step, Writable};
 use crate::engine::time::Duration;
 use crate::engine::value::Decimal;
@@ -27,6 +27,8 @@ record! {
         wire: Option<Wire>,
         /// What can be read and written, by name.
         points: Map<Name, Point>,
+        /// Things made of several points, by name or, in a repeated group, by path.
+        things: Map<PointPath, Thing> = Map::default(),
         /// Spans of the manual that are no points, each with its reason.
         left_out: Map<Span, String> = Map::default(),
         /// How points look, by their paths; only what the facts above cannot tell.
@@ -122,6 +124,16 @@ record! {
         by: Option<At<PointPath>>,
         /// The cases, by the deciding point's named values; `null`: no reading then. Or a shared file.
         is: Option<At<Cases>>,
+        /// It is understood as the point that this one, which `refers`, names now.
+        like: Option<At<PointPath>>,
+        /// It holds the number of a register of this span, and is shown as the name of the point there.
+        refers: Option<At<Span>>,
+        /// It lives only while each of these points has one of these values.
+        when: Map<PointPath, Vec<At<String>>> = Map::default(),
+        /// An array of so many values of the type.
+        count: Option<At<u16>>,
+        /// Each flip of this bit is an event of this type.
+        event: Option<At<Name>>,
         /// Flags by their bits, 0 the lowest; each becomes a point.
         bits: Option<At<Map<u8, Name>>>,
         /// When it is read.
@@ -134,6 +146,12 @@ record! {
         write_at_step: Option<At<Step>>,
         /// The only function code that writes it.
         write_with: Option<At<WriteFunction>>,
+        /// So long the device needs until what was written can be read back.
+        settle: Option<At<Duration>>,
+        /// The device acts only when the content changes: this named value stands between two equal ones.
+        on_change: Option<At<String>>,
+        /// The point with the longest time between two writes; what the register holds is repeated in time.
+        heartbeat: Option<At<PointPath>>,
         /// A button: the word that is written.
         press: Option<At<u16>>,
         /// The word pressed may read back as 0.
@@ -147,6 +165,24 @@ record! {
         /// Points that a write to this one changes.
         re_read: Vec<At<PointPath>> = Vec::new(),
     } and form: Form
+}
+
+record! {
+    /// Several points that are one thing to a person.
+    pub struct Thing {
+        /// What it is.
+        r#as: At<ThingKind>,
+        /// It lives only while each of these points has one of these values.
+        when: Map<PointPath, Vec<At<String>>> = Map::default(),
+        /// Its states, each with the values of points that make it; the first that holds counts.
+        state: Map<String, Map<PointPath, At<String>>> = Map::default(),
+        /// Its commands, each with what is written, one after the other.
+        r#do: Map<String, Vec<Map<PointPath, At<String>>>> = Map::default(),
+        /// The point with the present temperature; of a climate only.
+        temperature: Option<At<PointPath>>,
+        /// The point that is the wanted temperature; of a climate only.
+        target: Option<At<PointPath>>,
+    }
 }
 
 record! {

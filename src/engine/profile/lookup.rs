@@ -7,13 +7,27 @@ use crate::engine::profile::resolve::Resolution;
 use crate::engine::profile::text::{Name, PointPath};
 use crate::engine::yaml::{At, Map, list_of_choices};
 
+/// From where a name is looked up: a repetition of a group, or the top.
+#[derive(Clone, Copy, Default)]
+pub struct Scope<'a> {
+    pub group: Option<&'a str>,
+    pub repetition: Option<u16>,
+}
+
+impl<'a> From<&'a Expanded<'_>> for Scope<'a> {
+    fn from(expanded: &'a Expanded<'_>) -> Scope<'a> {
+        Scope { group: expanded.group.as_deref(), repetition: expanded.repetition }
+    }
+}
+
 impl Resolution<'_, '_> {
     /// The one point that `path` names, as seen from `from` or from the top.
-    pub fn lookup(&mut self, path: &At<PointPath>, from: Option<&Expanded<'_>>) -> Option<PointIndex> {
+    pub fn lookup<'s>(&mut self, path: &At<PointPath>, from: impl Into<Scope<'s>>) -> Option<PointIndex> {
+        let from = from.into();
         let found = self.lookup_all(path, from);
         if found.len() > 1 {
             let (path_text, count, first) = (&path.value.0, found.len(), &self.points[found[0]].name);
-            let expected = match from {
+            let expected = match from.group {
                 Some(_) => "one that is there once, or one of the same repetition",
                 None => "one that is there once",
             };
@@ -27,7 +41,8 @@ impl Resolution<'_, '_> {
     }
 
     /// All points that `path` names: those of the same repetition as `from`, or else those at the top.
-    pub fn lookup_all(&mut self, path: &At<PointPath>, from: Option<&Expanded<'_>>) -> Vec<PointIndex> {
+    pub fn lookup_all<'s>(&mut self, path: &At<PointPath>, from: impl Into<Scope<'s>>) -> Vec<PointIndex> {
+        let from = from.into();
         let found = self.find(&path.value, from);
         if found.is_empty() && !self.may_be_unread(&path.value.0) {
             let prefix = prefix_of_group(from);
@@ -46,20 +61,25 @@ impl Resolution<'_, '_> {
     }
 
     /// As `lookup_all`, but it is no fault if there is none.
-    fn find(&self, path: &PointPath, from: Option<&Expanded<'_>>) -> Vec<PointIndex> {
-        if let (Some(prefix), Some(from)) = (prefix_of_group(from), from) {
+    fn find(&self, path: &PointPath, from: Scope<'_>) -> Vec<PointIndex> {
+        if let Some(prefix) = prefix_of_group(from) {
             let beside =
                 self.with_path(&format!("{prefix}{}", path.0), |point| point.repetition == from.repetition);
             if !beside.is_empty() {
                 return beside;
             }
         }
-        self.with_path(&path.0, |_| true)
+        let found = self.with_path(&path.0, |_| true);
+        if !found.is_empty() {
+            return found;
+        }
+        // One of several repetitions, by its whole name.
+        (0..self.points.len()).filter(|index| self.points[*index].name == path.0).collect()
     }
 
     /// Whether the device surely has no point that `path` names.
     pub fn is_missing(&self, path: &PointPath, from: &Expanded<'_>) -> bool {
-        self.find(path, Some(from)).is_empty() && !self.may_be_unread(&path.0)
+        self.find(path, from.into()).is_empty() && !self.may_be_unread(&path.0)
     }
 
     fn with_path(&self, path: &str, and: impl Fn(&Expanded<'_>) -> bool) -> Vec<PointIndex> {
@@ -78,6 +98,6 @@ impl Resolution<'_, '_> {
 }
 
 /// `channel.` of a point in the group `channel`.
-fn prefix_of_group(from: Option<&Expanded<'_>>) -> Option<String> {
-    Some(format!("{}.", from?.group.as_ref()?))
+fn prefix_of_group(from: Scope<'_>) -> Option<String> {
+    Some(format!("{}.", from.group?))
 }

@@ -12,6 +12,7 @@ mod lookup;
 mod resolve;
 mod shared;
 mod text;
+mod things;
 
 pub use library::Library;
 
@@ -90,6 +91,7 @@ pub fn load_inline(
         identify: None,
         wire,
         points: read(points, faults)?,
+        things: Map::default(),
         left_out: Map::default(),
         home_assistant,
     };

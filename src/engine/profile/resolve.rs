@@ -3,12 +3,14 @@
 //! A fault here leaves something harmless in the device's place, so that the checks can go on and
 //! all faults are told at once; a device with faults is never handed out.
 
+use crate::engine::address::Span;
 use crate::engine::device::{
-    self, Case, Decimals, Device, Encoding, Kind, Names, Order, Point, PointIndex, Poll, Presentation,
-    Quirks, Unit, Write, WriteRule,
+    self, Case, Condition, Decimals, Device, Encoding, Kind, Names, Order, Point, PointIndex, Poll,
+    Presentation, Quirks, Unit, Write, WriteRule,
 };
 use crate::engine::profile::expand::Expanded;
-use crate::engine::profile::file::{Cases, Form, Profile, SharedCase, Values};
+use crate::engine::profile::file::{self, Cases, Form, Profile, SharedCase, Values};
+use crate::engine::profile::lookup::Scope;
 use crate::engine::profile::shared::Shared;
 use crate::engine::profile::text::{Digits, PointPath, Quirk, Writable};
 use crate::engine::value::Decimal;
@@ -18,7 +20,8 @@ use crate::engine::yaml::{At, Faults, Map, Place, list_of_choices};
 pub fn device(profile: &Profile, points: &[Expanded<'_>], shared: &Shared, faults: &mut Faults) -> Device {
     let mut resolution = Resolution { profile, points, shared, faults };
     let mut resolved: Vec<Point> = (0..points.len()).map(|index| resolution.point(index)).collect();
-    resolution.presentations(&mut resolved);
+    let mut things = resolution.things();
+    resolution.presentations(&mut resolved, &mut things);
     let wire = resolution.wire();
     let identify = resolution.identify();
     Device {
@@ -29,6 +32,7 @@ pub fn device(profile: &Profile, points: &[Expanded<'_>], shared: &Shared, fault
         identify,
         wire,
         points: resolved,
+        things,
         left_out: profile
             .left_out
             .iter()
@@ -50,16 +54,24 @@ impl Resolution<'_, '_> {
         let file = expanded.file;
         let encoding = match (&file.by, &file.is) {
             (Some(by), Some(cases)) if !expanded.is_flag => self.cases(expanded, by, cases),
+            _ if file.like.is_some() => self.cases_of_likeness(expanded),
             _ => Encoding::Plain(self.form(expanded, &file.form)),
         };
-        let re_read = file.re_read.iter().flat_map(|path| self.lookup_all(path, Some(expanded))).collect();
+        let re_read = file.re_read.iter().flat_map(|path| self.lookup_all(path, expanded)).collect();
+        let when = self.conditions(&file.when, expanded.into());
+        let heartbeat = file.heartbeat.as_ref().and_then(|path| self.lookup(path, expanded));
+        let write = if expanded.is_flag { None } else { self.write_of(expanded) };
         Point {
             name: expanded.name.clone(),
             at: expanded.at,
             also: expanded.also,
             encoding,
             poll: file.poll.as_ref().map_or(Poll::Never, |poll| poll.value),
-            write: if expanded.is_flag { None } else { write_of(expanded) },
+            when,
+            write,
+            heartbeat,
+            refers: file.refers.as_ref().map(|span| span.value),
+            event: file.event.as_ref().map(|event| event.value.0.clone()),
             persistent: file.persistent.as_ref().is_some_and(|persistent| persistent.value),
             read_clears: file.read_clears.as_ref().is_some_and(|read_clears| read_clears.value),
             default: file.default.as_ref().map(|default| default.value),
@@ -69,11 +81,53 @@ impl Resolution<'_, '_> {
         }
     }
 
+    /// Names of the points' values to what the points hold then.
+    pub fn conditions(&mut self, when: &Map<PointPath, Vec<At<String>>>, from: Scope<'_>) -> Vec<Condition> {
+        let mut conditions = Vec::new();
+        for (path, wanted) in when.iter() {
+            let Some(point) = self.lookup(path, from) else { continue };
+            let names = self.deciding_names(point);
+            if names.is_empty() {
+                if self.points[point].file.form.values.is_none() {
+                    self.faults.add(
+                        &path.place,
+                        format!(
+                            "`{}` has no named values that could decide; expected `values` there",
+                            path.value.0
+                        ),
+                    );
+                }
+                continue;
+            }
+            let known: Vec<&str> = names.iter().map(|(_, name)| name.as_str()).collect();
+            for name in wanted.iter().filter(|name| !known.contains(&name.value.as_str())) {
+                let choices = list_of_choices(&name.value, &known);
+                let message = format!("`{}` is no value of `{}`; {choices}", name.value, path.value.0);
+                self.faults.add(&name.place, message);
+            }
+            let is_wanted = |name: &String| wanted.iter().any(|wanted| wanted.value == *name);
+            let values = names.into_iter().filter(|(_, name)| is_wanted(name)).collect();
+            conditions.push(Condition { point, values });
+        }
+        conditions
+    }
+
+    /// The values of a point by which it can decide about others; a flag's are `OFF` and `ON`.
+    fn deciding_names(&self, point: PointIndex) -> Vec<(i128, String)> {
+        let selector = &self.points[point];
+        let names = self.names(selector, &selector.file.form);
+        if names.is_empty() && kind_of(selector, &selector.file.form, &names) == Kind::Bool {
+            return vec![(0, "OFF".into()), (1, "ON".into())];
+        }
+        names
+    }
+
     fn form(&mut self, expanded: &Expanded<'_>, form: &Form) -> device::Form {
         self.names_left_out_are_there(form);
         let names = self.names(expanded, form);
         let kind = kind_of(expanded, form, &names);
         let mut resolved = device::Form::new(kind);
+        resolved.elements = expanded.file.count.as_ref().map_or(1, |count| count.value);
         resolved.order = form.order.unwrap_or_else(|| self.order());
         resolved.scale = form.scale.as_ref().map_or(Decimal::ONE, |scale| scale.value);
         resolved.offset = form.offset.as_ref().map_or(Decimal::ZERO, |offset| offset.value);
@@ -82,13 +136,13 @@ impl Resolution<'_, '_> {
             Some(At { value: Digits::Fixed(decimals), .. }) => Some(Decimals::Fixed(*decimals)),
             Some(At { value: Digits::By(path), place }) => {
                 let path = At { value: path.clone(), place: place.clone() };
-                self.lookup(&path, Some(expanded)).map(Decimals::By)
+                self.lookup(&path, expanded).map(Decimals::By)
             }
         };
         // The point's own unit stands where a shared case leaves it to a point that this device has not.
         resolved.unit = match (&form.unit, &form.unit_by, &expanded.file.form.unit) {
             (Some(unit), _, _) | (None, Some(_), Some(unit)) => Unit::Fixed(unit.value.clone()),
-            (None, Some(path), None) => self.lookup(path, Some(expanded)).map_or(Unit::None, Unit::By),
+            (None, Some(path), None) => self.lookup(path, expanded).map_or(Unit::None, Unit::By),
             (None, None, _) => Unit::None,
         };
         resolved.difference = expanded.file.difference;
@@ -111,6 +165,15 @@ impl Resolution<'_, '_> {
 
     /// The named register values of `form`.
     fn names(&self, expanded: &Expanded<'_>, form: &Form) -> Vec<(i128, String)> {
+        let mut names = self.names_of_values(expanded, form);
+        if let Some(span) = &expanded.file.refers {
+            let there = referred(self.points, span.value);
+            names.extend(there.map(|(number, point)| (number, point.name.clone())));
+        }
+        names
+    }
+
+    fn names_of_values(&self, expanded: &Expanded<'_>, form: &Form) -> Vec<(i128, String)> {
         match form.values.as_ref().map(|values| &values.value) {
             _ if expanded.is_flag => Vec::new(),
             None => Vec::new(),
@@ -148,12 +211,9 @@ impl Resolution<'_, '_> {
     fn cases(&mut self, expanded: &Expanded<'_>, by: &At<PointPath>, cases: &At<Cases>) -> Encoding {
         // A float can be anything, so that no check finds fault with what is only unknown.
         let unknown = Encoding::Plain(device::Form::new(Kind::F32));
-        let Some(by_index) = self.lookup(by, Some(expanded)) else { return unknown };
+        let Some(by_index) = self.lookup(by, expanded) else { return unknown };
         let selector = &self.points[by_index];
-        let mut names = self.names(selector, &selector.file.form);
-        if names.is_empty() && kind_of(selector, &selector.file.form, &names) == Kind::Bool {
-            names = vec![(0, "OFF".into()), (1, "ON".into())];
-        }
+        let names = self.deciding_names(by_index);
         if names.is_empty() {
             if selector.file.form.values.is_none() {
                 self.faults.add(
@@ -219,6 +279,67 @@ impl Resolution<'_, '_> {
             );
         }
         Encoding::Cases { by: by_index, cases: resolved }
+    }
+
+    /// The cases of `like`: a register whose number the selector holds is understood as the point there.
+    fn cases_of_likeness(&mut self, expanded: &Expanded<'_>) -> Encoding {
+        let unknown = Encoding::Plain(device::Form::new(Kind::F32));
+        let Some(like) = &expanded.file.like else { return unknown };
+        let Some(by) = self.lookup(like, expanded) else { return unknown };
+        let Some(span) = self.points[by].file.refers.as_ref().map(|span| span.value) else {
+            self.faults.add(
+                &like.place,
+                format!("`{}` names no register; expected a point that `refers` to a span", like.value.0),
+            );
+            return unknown;
+        };
+        let mut cases = Vec::new();
+        for (key, name) in self.deciding_names(by) {
+            let there = referred(self.points, span).find(|(number, _)| *number == key);
+            // A point with cases needs its own selector; as somebody else's extreme it has no reading.
+            let there = there.map(|(_, point)| point).filter(|point| point.file.is.is_none());
+            let form = there.map(|point| self.form(point, &point.file.form));
+            cases.push(Case { key, name, form });
+        }
+        Encoding::Cases { by, cases }
+    }
+
+    fn write_of(&mut self, expanded: &Expanded<'_>) -> Option<Write> {
+        let file = expanded.file;
+        let rule = match (&file.press, &file.write) {
+            (Some(word), _) => WriteRule::Press {
+                word: word.value,
+                self_clearing: file.self_clearing.as_ref().is_some_and(|clearing| clearing.value),
+            },
+            (None, Some(write)) => match &write.value {
+                Writable::Any => WriteRule::Any,
+                Writable::Range { range, step } => {
+                    WriteRule::Range { min: range.min, max: range.max, step: *step }
+                }
+                Writable::Names(names) => {
+                    WriteRule::Names(names.iter().map(|name| name.value.clone()).collect())
+                }
+            },
+            (None, None) => return None,
+        };
+        let on_change = file.on_change.as_ref().and_then(|between| {
+            let names = self.names(expanded, &file.form);
+            let found = names.iter().find(|(_, name)| *name == between.value).map(|(raw, _)| *raw);
+            if found.is_none() {
+                let known: Vec<&str> = names.iter().map(|(_, name)| name.as_str()).collect();
+                let choices = list_of_choices(&between.value, &known);
+                let message = format!("`{}` is none of the point's `values`; {choices}", between.value);
+                self.faults.add(&between.place, message);
+            }
+            found
+        });
+        Some(Write {
+            at: expanded.write_at.unwrap_or(expanded.at),
+            with: file.write_with.as_ref().map(|function| function.value),
+            rule,
+            settle: file.settle.as_ref().map(|settle| settle.value).unwrap_or_default(),
+            on_change,
+        })
     }
 
     /// Whether what the shared cases say of units can be resolved: with the point that they name, or with
@@ -290,7 +411,7 @@ impl Resolution<'_, '_> {
             clamps_with_exception: wire.quirks.contains(&Quirk::ClampsWithException),
             exception_function_varies: wire.quirks.contains(&Quirk::ExceptionFunctionVaries),
         };
-        resolved.watchdog = wire.watchdog.as_ref().and_then(|path| self.lookup(path, None));
+        resolved.watchdog = wire.watchdog.as_ref().and_then(|path| self.lookup(path, Scope::default()));
         resolved
     }
 
@@ -322,45 +443,48 @@ impl Resolution<'_, '_> {
         }
     }
 
-    fn presentations(&mut self, resolved: &mut [Point]) {
+    fn presentations(&mut self, points: &mut [Point], things: &mut [device::Thing]) {
         for (path, wish) in self.profile.home_assistant.iter() {
-            for index in self.lookup_all(path, None) {
-                let text = |text: &Option<At<String>>| text.as_ref().map(|text| text.value.clone());
-                resolved[index].presentation = Presentation {
-                    platform: wish.r#as.as_ref().map(|platform| platform.value),
-                    name: wish.name.as_ref().map(|name| match self.points[index].repetition {
-                        Some(number) => format!("{name} {number}"),
-                        None => name.clone(),
-                    }),
-                    device_class: text(&wish.device_class),
-                    state_class: text(&wish.state_class),
-                    category: wish.category,
-                    icon: text(&wish.icon),
-                    enabled: wish.enabled,
-                };
+            let of_things = self.things_with_path(&path.value);
+            if !of_things.is_empty() {
+                for (index, repetition) in of_things {
+                    things[index].presentation = presentation(wish, repetition);
+                }
+                continue;
+            }
+            for index in self.lookup_all(path, Scope::default()) {
+                points[index].presentation = presentation(wish, self.points[index].repetition);
             }
         }
     }
 }
 
-fn write_of(expanded: &Expanded<'_>) -> Option<Write> {
-    let file = expanded.file;
-    let rule = match (&file.press, &file.write) {
-        (Some(word), _) => WriteRule::Press {
-            word: word.value,
-            self_clearing: file.self_clearing.as_ref().is_some_and(|clearing| clearing.value),
-        },
-        (None, Some(write)) => match &write.value {
-            Writable::Any => WriteRule::Any,
-            Writable::Range { range, step } => {
-                WriteRule::Range { min: range.min, max: range.max, step: *step }
-            }
-            Writable::Names(names) => WriteRule::Names(names.iter().map(|name| name.value.clone()).collect()),
-        },
-        (None, None) => return None,
+/// The points that have a whole register of `span`, each with its number.
+fn referred<'a, 'f>(
+    points: &'a [Expanded<'f>],
+    span: Span,
+) -> impl Iterator<Item = (i128, &'a Expanded<'f>)> {
+    let is_meant = move |point: &&Expanded<'_>| {
+        let at = point.at;
+        !point.is_flag && at.bits.is_none() && at.span.count() == 1 && span.contains(at.span)
     };
-    let at = expanded.write_at.unwrap_or(expanded.at);
-    Some(Write { at, with: file.write_with.as_ref().map(|function| function.value), rule })
+    points.iter().filter(is_meant).map(|point| (i128::from(point.at.span.first()), point))
+}
+
+fn presentation(wish: &file::Presentation, repetition: Option<u16>) -> Presentation {
+    let text = |text: &Option<At<String>>| text.as_ref().map(|text| text.value.clone());
+    Presentation {
+        platform: wish.r#as.as_ref().map(|platform| platform.value),
+        name: wish.name.as_ref().map(|name| match repetition {
+            Some(number) => format!("{name} {number}"),
+            None => name.clone(),
+        }),
+        device_class: text(&wish.device_class),
+        state_class: text(&wish.state_class),
+        category: wish.category,
+        icon: text(&wish.icon),
+        enabled: wish.enabled,
+    }
 }
 
 /// Whether `values` beside it are names of some numbers, and not an enumeration.

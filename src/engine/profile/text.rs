@@ -4,7 +4,7 @@ use serde_json::{Value as Json, json};
 
 use crate::choices;
 use crate::engine::address::{Address, Bits, Span, Table};
-use crate::engine::device::{Category, Kind, Order, Platform, Poll, WriteFunction};
+use crate::engine::device::{Category, Kind, Order, Platform, Poll, ThingKind, WriteFunction};
 use crate::engine::value::Decimal;
 use crate::engine::yaml::{At, Content, Definitions, Faults, Node, Read, Scalar};
 
@@ -31,6 +31,13 @@ choices! { "a platform of a single point", Platform {
     "select" => Platform::Select,
     "button" => Platform::Button,
     "text" => Platform::Text,
+} }
+
+choices! { "a kind of thing", ThingKind {
+    "cover" => ThingKind::Cover,
+    "valve" => ThingKind::Valve,
+    "climate" => ThingKind::Climate,
+    "button" => ThingKind::Button,
 } }
 
 choices! { "a category", Category {

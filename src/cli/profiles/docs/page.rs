@@ -44,6 +44,7 @@ fn by_platform(device: &Device, wanted: impl Fn(&Entity) -> bool) -> Vec<(Platfo
         Platform::BinarySensor,
         Platform::Button,
         Platform::Text,
+        Platform::Event,
     ] {
         let of_platform = entities.iter().filter(|entity| entity.platform == platform);
         let names: Vec<&str> = of_platform.map(|entity| entity.name.as_str()).collect();

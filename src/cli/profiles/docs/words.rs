@@ -15,7 +15,7 @@ pub const NAMES_IN_CELL: usize = 4;
 /// What Home Assistant makes of a point while the device is set as it leaves the factory; of a point
 /// that then has no reading, what it makes of it in the first case that has one.
 pub fn entity_of(device: &Device, index: PointIndex) -> Option<Entity> {
-    let usual = usual_registers(device);
+    let usual = usual_registers(device, index);
     entity(device, index, &usual).or_else(|| match &device.points[index].encoding {
         Encoding::Plain(_) => None,
         Encoding::Cases { by, cases } => cases.iter().find_map(|case| {
@@ -36,6 +36,10 @@ pub fn platform(platform: Platform) -> (&'static str, &'static str) {
         Platform::Select => ("select", "Selections"),
         Platform::Button => ("button", "Buttons"),
         Platform::Text => ("text", "Texts"),
+        Platform::Event => ("event", "Events"),
+        Platform::Cover => ("cover", "Covers"),
+        Platform::Valve => ("valve", "Valves"),
+        Platform::Climate => ("climate", "Climates"),
     }
 }
 
@@ -103,7 +107,7 @@ fn numbers(device: &Device, index: PointIndex, form: &Form, rule: Option<&WriteR
             _ => dot,
         });
     }
-    let resolved = codec::resolve(device, index, &usual_registers(device)).ok()?;
+    let resolved = codec::resolve(device, index, &usual_registers(device, index)).ok()?;
     match rule.and_then(|rule| codec::limits(&resolved, rule)) {
         Some(limits) => Some(span_of_numbers(limits.min, limits.max, limits.step)),
         None => measured(form),
@@ -145,7 +149,7 @@ fn steps(step: Decimal) -> String {
 /// The factory setting as it is shown.
 pub fn default(device: &Device, index: PointIndex) -> String {
     let Some(raw) = device.points[index].default else { return String::new() };
-    let shown = codec::resolve(device, index, &usual_registers(device)).ok();
+    let shown = codec::resolve(device, index, &usual_registers(device, index)).ok();
     match shown.map(|resolved| codec::read(&resolved, &words(&resolved, raw))) {
         Some(Reading::Missing(Missing::UnknownValue(_) | Missing::NotText | Missing::NotANumber)) | None => {
             format!("register {raw}")
@@ -180,7 +184,7 @@ pub fn place(point: &Point) -> String {
 
 /// Whether it can be written, and how.
 pub fn writing(point: &Point) -> String {
-    let Some(Write { at, with, rule }) = &point.write else { return "no".into() };
+    let Some(Write { at, with, rule, .. }) = &point.write else { return "no".into() };
     let mut words = vec![match rule {
         WriteRule::Any | WriteRule::Range { .. } => "yes".to_string(),
         WriteRule::Names(names) => format!("only {}", codes(names.iter().map(String::as_str))),

@@ -24,6 +24,18 @@ impl Rules<'_, '_> {
 
     fn cases_come_with_what_decides(&mut self) {
         for Subject { file, .. } in self.entries() {
+            if let Some(like) = &file.like {
+                let others = [file.by.as_ref().map(|by| ("by", &by.place))].into_iter().flatten();
+                for (key, place) in others.chain(said(&file.form)) {
+                    self.faults.add(
+                        place,
+                        format!(
+                            "`{key}` beside `like: {}`, which says it; remove one of the two",
+                            like.value.0
+                        ),
+                    );
+                }
+            }
             match (&file.by, &file.is) {
                 (Some(by), None) => self.faults.add(
                     &by.place,

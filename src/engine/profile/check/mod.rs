@@ -3,9 +3,11 @@
 //! Each rule is a function whose name says it. A fault stands at the key that breaks the rule; what
 //! all repetitions of an entry share is told once.
 
+mod living;
 mod meaning;
 mod places;
 mod presentation;
+mod things;
 mod writing;
 
 use crate::engine::device::{Device, Encoding, Form, Point};
@@ -22,6 +24,8 @@ pub fn check(profile: &Profile, points: &[Expanded<'_>], device: &Device, faults
     rules.places();
     rules.meaning();
     rules.writing();
+    rules.living();
+    rules.things();
     rules.presentation();
 }
 

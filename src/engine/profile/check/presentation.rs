@@ -9,6 +9,7 @@ use crate::engine::yaml::list_of_choices;
 impl Rules<'_, '_> {
     pub fn presentation(&mut self) {
         self.looks_fit_what_the_point_is();
+        self.looks_fit_what_the_thing_is();
         self.icons_are_of_the_known_set();
     }
 
@@ -52,6 +53,29 @@ impl Rules<'_, '_> {
                 self.faults.add(&key.place, message);
             } else if let (Some(key), Some(message)) = (&wish.state_class, first_fault(class, state_class)) {
                 self.faults.add(&key.place, message);
+            }
+        }
+    }
+
+    fn looks_fit_what_the_thing_is(&mut self) {
+        for (path, wish) in self.profile.home_assistant.iter() {
+            let things = self.profile.things.iter();
+            let Some((_, thing)) = things.into_iter().find(|(own, _)| own.value == path.value) else {
+                continue;
+            };
+            let platform = thing.r#as.value.platform();
+            if let Some(key) = &wish.r#as {
+                let message = format!("`{}` says under `things` what it is; remove `as`", path.value.0);
+                self.faults.add(&key.place, message);
+            }
+            let classes = [(&wish.device_class, true), (&wish.state_class, false)];
+            for (key, is_class) in classes {
+                let Some(key) = key else { continue };
+                let value = Some(key.value.as_str());
+                let (class, state_class) = if is_class { (value, None) } else { (None, value) };
+                if let Err(message) = units::check(platform, class, None, state_class) {
+                    self.faults.add(&key.place, message);
+                }
             }
         }
     }
