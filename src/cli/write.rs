@@ -118,7 +118,7 @@ fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
     let Some(mut flow) = flow else {
         return match step {
             Step::Finished(outcome) => Err(Failure::wrong(outcome.reason.unwrap_or_default())),
-            Step::Ask(_) => Ok(()),
+            Step::Ask(_) | Step::Settle(_) => Ok(()),
         };
     };
     let outcome = loop {
@@ -127,6 +127,10 @@ fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
             Step::Ask(call) => {
                 let result = asked.ask(&call)?;
                 step = flow.answered(&device, &known, &result);
+            }
+            Step::Settle(time) => {
+                std::thread::sleep(time);
+                step = Step::Ask(flow.settled(&device));
             }
         }
     };

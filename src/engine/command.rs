@@ -1,7 +1,7 @@
 //! One command, from the wanted value to exactly one outcome.
 //!
 //! Read first where it matters (EEPROM is written only if it differs; a field of bits needs its
-//! neighbours), write, read back, compare. A write without an answer is never repeated: what the
+//! neighbours; some devices act only on another value), write, let it settle, read back, compare. A write without an answer is never repeated: what the
 //! device holds is read, and decides. The state topic is none of this module's business: it shows
 //! only what reads found.
 
@@ -9,6 +9,7 @@ use crate::engine::address::{Address, Span};
 use crate::engine::codec;
 use crate::engine::device::{Device, Names, Point, PointIndex, Write, WriteFunction, WriteRule};
 use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
+use crate::engine::time::Duration;
 
 /// A command that has begun.
 #[derive(Clone, Debug, PartialEq)]
@@ -22,8 +23,12 @@ pub struct CommandFlow {
 enum State {
     /// Reads what is there, to compare or to keep the neighbouring bits.
     ReadingBefore { field: Vec<u16> },
+    /// The value that stands between two equal ones is on its way.
+    WritingBetween { field: Vec<u16>, then: Call },
     /// The write is on its way. `field` is what the point's own bits shall be.
     Writing { field: Vec<u16> },
+    /// The device takes its time; then it is read back.
+    Settling { field: Vec<u16>, doubt: Option<Doubt> },
     /// Reads what the device holds now. `doubt` says what was wrong with the write's own answer.
     ReadingBack { field: Vec<u16>, doubt: Option<Doubt> },
 }
@@ -40,6 +45,8 @@ enum Doubt {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Step {
     Ask(Call),
+    /// Wait so long, while others may be asked, and go on with [`CommandFlow::settled`].
+    Settle(Duration),
     Finished(Outcome),
 }
 
@@ -122,7 +129,8 @@ impl CommandFlow {
             Err(missing) => return refuse(missing.to_string()),
         };
         let flow = |state| CommandFlow { point, wanted: wanted.to_string(), state };
-        if is_press(write) || !(details.persistent || write.at.bits.is_some()) {
+        let reads_before = details.persistent || write.at.bits.is_some() || write.on_change.is_some();
+        if is_press(write) || !reads_before {
             let call = write_call(write, &field);
             return (Some(flow(State::Writing { field })), Step::Ask(call));
         }
@@ -131,6 +139,14 @@ impl CommandFlow {
 
     pub fn point(&self) -> PointIndex {
         self.point
+    }
+
+    /// The time to settle has passed: the question that reads back.
+    pub fn settled(&mut self, device: &Device) -> Call {
+        if let State::Settling { field, doubt } = &self.state {
+            self.state = State::ReadingBack { field: field.clone(), doubt: doubt.clone() };
+        }
+        Call::Read(device.points[self.point].at.span)
     }
 
     /// Whether the question under way reads the point's place: the answer is news for every point in it.
@@ -151,7 +167,17 @@ impl CommandFlow {
         };
         match self.state.clone() {
             State::ReadingBefore { field } => self.read_before(device, details, write, known, field, result),
+            State::WritingBetween { field, then } => match result {
+                Ok(_) => {
+                    self.state = State::Writing { field };
+                    Step::Ask(then)
+                }
+                Err(RequestError::Exception(code)) => self.refused_by_device(*code),
+                Err(error) => self.finish(OutcomeKind::NoReply, None, Some(error.to_string())),
+            },
             State::Writing { field } => self.written(device, details, write, field, result),
+            // Nothing is asked meanwhile.
+            State::Settling { .. } => Step::Settle(write.settle),
             State::ReadingBack { field, doubt } => {
                 self.read_back(device, details, write, known, &field, doubt, result)
             }
@@ -182,19 +208,31 @@ impl CommandFlow {
             let found = tell(device, self.point, known, &held);
             return self.finish(OutcomeKind::Unchanged, found, None);
         }
-        let Some(bits) = write.at.bits else {
-            self.state = State::Writing { field: field.clone() };
-            return Step::Ask(write_call(write, &field));
+        let whole = |field: &[u16]| match write.at.bits {
+            Some(bits) => write_call(write, &[bits.insert(words[0], field[0])]),
+            None => write_call(write, field),
         };
-        if let Some(meaning) = meaning_of_whole_register(device, write.at.span, words[0]) {
-            // One bit changed in 11111 would be a number out of range, which a device may clamp to
-            // "all relays on" (FuehlerSysteme, chapters 6.1.2 and 9).
-            let reason = format!("the register holds {meaning}, of which single bits cannot be changed");
-            return self.finish(OutcomeKind::Refused, None, Some(reason));
+        if write.at.bits.is_some() {
+            if let Some(meaning) = meaning_of_whole_register(device, write.at.span, words[0]) {
+                // One bit changed in 11111 would be a number out of range, which a device may clamp to
+                // "all relays on" (FuehlerSysteme, chapters 6.1.2 and 9).
+                let reason = format!("the register holds {meaning}, of which single bits cannot be changed");
+                return self.finish(OutcomeKind::Refused, None, Some(reason));
+            }
         }
-        let call = write_call(write, &[bits.insert(words[0], field[0])]);
-        self.state = State::Writing { field };
-        Step::Ask(call)
+        let call = whole(&field);
+        match write.on_change.filter(|_| held == field) {
+            Some(between) => {
+                let mut other = vec![0; field.len()];
+                other[field.len() - 1] = between as u16;
+                self.state = State::WritingBetween { field, then: call };
+                Step::Ask(whole(&other))
+            }
+            None => {
+                self.state = State::Writing { field };
+                Step::Ask(call)
+            }
+        }
     }
 
     fn written(
@@ -216,6 +254,10 @@ impl CommandFlow {
             Err(error) if press => return self.finish(OutcomeKind::NoReply, None, Some(error.to_string())),
             Err(error) => Some(Doubt::NoAnswer(error.clone())),
         };
+        if write.settle > Duration::ZERO {
+            self.state = State::Settling { field, doubt };
+            return Step::Settle(write.settle);
+        }
         self.state = State::ReadingBack { field, doubt };
         Step::Ask(Call::Read(details.at.span))
     }
@@ -289,7 +331,7 @@ fn tell(device: &Device, point: PointIndex, known: &[Option<i128>], held: &[u16]
 }
 
 /// The request that puts `words` at the point's place.
-fn write_call(write: &Write, words: &[u16]) -> Call {
+pub fn write_call(write: &Write, words: &[u16]) -> Call {
     let Address { span, .. } = write.at;
     let address = span.first();
     if span.table().is_bits() {

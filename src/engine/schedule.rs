@@ -28,6 +28,8 @@ struct Planned {
     tried: bool,
     /// Answered with an exception: not asked again before.
     paused_until: Time,
+    /// Holds nothing that lives now.
+    sleeps: bool,
 }
 
 /// How much a read is wanted; the greatest is next.
@@ -54,6 +56,7 @@ impl Polls {
             wanted_now: true,
             tried: false,
             paused_until: Time::default(),
+            sleeps: false,
         };
         Polls { reads: reads.into_iter().map(planned).collect() }
     }
@@ -126,9 +129,16 @@ impl Polls {
         }
     }
 
+    /// Which reads hold nothing that lives now, and are not sent.
+    pub fn sleep(&mut self, sleeps: impl Fn(&Read) -> bool) {
+        for planned in &mut self.reads {
+            planned.sleeps = sleeps(&planned.read);
+        }
+    }
+
     /// Whether each read has been answered since the connect.
     pub fn first_round_is_over(&self) -> bool {
-        self.reads.iter().all(|planned| planned.tried)
+        self.reads.iter().all(|planned| planned.tried || planned.sleeps)
     }
 
     /// Takes over the reads of a new plan; what both plans have in common keeps its times, and only
@@ -156,7 +166,7 @@ impl Polls {
 
 impl Planned {
     fn urgency(&self, now: Time) -> Option<Urgency> {
-        if now < self.paused_until {
+        if now < self.paused_until || self.sleeps {
             return None;
         }
         if self.wanted_now {
@@ -168,6 +178,9 @@ impl Planned {
     }
 
     fn due_at(&self) -> Option<Time> {
+        if self.sleeps {
+            return None;
+        }
         let due = if self.wanted_now { Time::default() } else { self.began_at? + self.period? };
         Some(due.max(self.paused_until))
     }

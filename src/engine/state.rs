@@ -14,6 +14,8 @@ pub struct Values {
     known: Vec<Option<i128>>,
     /// For each point, those that it decides.
     dependents: Vec<Vec<PointIndex>>,
+    /// Whether a point decides about anything: other points, things, or a heartbeat.
+    decides: Vec<bool>,
     /// What is missing, or why, has changed since it was last asked.
     missing_changed: bool,
 }
@@ -30,6 +32,8 @@ struct Value {
 pub struct Absorbed {
     /// Points whose interpretation has changed with a selector; their readings have been dropped.
     pub dropped: Vec<PointIndex>,
+    /// Something that decides about others has changed.
+    pub decided: bool,
     /// Points that hold a register value which the profile does not name, seen for the first time.
     pub unnamed: Vec<(PointIndex, i128)>,
 }
@@ -44,8 +48,20 @@ impl Values {
                 dependents[selector].push(index);
             }
         }
+        let mut decides: Vec<bool> = dependents.iter().map(|dependents| !dependents.is_empty()).collect();
+        let conditions = device.things.iter().flat_map(|thing| &thing.when);
+        let others = conditions.map(|condition| condition.point);
+        others
+            .chain(device.points.iter().filter_map(|point| point.heartbeat))
+            .for_each(|point| decides[point] = true);
         let unknown = Value { reading: Reading::Missing(Missing::NotYetRead), read_at: None, told: None };
-        Values { values: vec![unknown; count], known: vec![None; count], dependents, missing_changed: true }
+        Values {
+            values: vec![unknown; count],
+            known: vec![None; count],
+            dependents,
+            decides,
+            missing_changed: true,
+        }
     }
 
     /// What the selectors say, for [`codec::resolve`].
@@ -61,9 +77,9 @@ impl Values {
         self.values[point].read_at
     }
 
-    /// Whether other points wait for this one.
+    /// Whether other points, things or a heartbeat wait for this one.
     pub fn is_selector(&self, point: PointIndex) -> bool {
-        !self.dependents[point].is_empty()
+        self.decides[point]
     }
 
     /// Takes in the words of a read that began after every write before it. Selectors come first:
@@ -77,6 +93,7 @@ impl Values {
             let known = known_field(&device.points[point], &field);
             if self.is_selector(point) && self.known[point] != known {
                 self.known[point] = known;
+                absorbed.decided = true;
                 self.drop_dependents(device, point, &mut absorbed.dropped);
             }
             let reading = match codec::resolve(device, point, &self.known) {
@@ -144,6 +161,17 @@ impl Values {
     /// Whether what is missing, or why, has changed since this was last called.
     pub fn take_missing_changed(&mut self) -> bool {
         std::mem::take(&mut self.missing_changed)
+    }
+
+    /// Whether this bit, which tells events, has flipped since it was last asked. After a silence the
+    /// first reading is none: nobody knows how often it has flipped.
+    pub fn take_flip(&mut self, now: Time, point: PointIndex) -> bool {
+        let value = &mut self.values[point];
+        let before = value.told.replace((value.reading.clone(), now));
+        match (before, &value.reading) {
+            (Some((Reading::Flag(before), _)), Reading::Flag(after)) => before != *after,
+            _ => false,
+        }
     }
 
     /// The text to publish for this point now: if it differs from what was told last (by at least the

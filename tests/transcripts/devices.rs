@@ -4,6 +4,7 @@ use busker::engine::address::{Address, Bits, Span, Table};
 use busker::engine::device::{
     Case, Decimals, Device, Encoding, Form, Identify, Kind, Names, Point, Poll, Unit, Write, WriteRule,
 };
+use busker::engine::profile::Library;
 use busker::engine::settings::{
     Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password, Settings,
 };
@@ -62,6 +63,7 @@ pub fn settings(header: &str) -> Settings {
 
 fn device(kind: &str) -> Device {
     match kind {
+        file if file.ends_with(".yaml") => of_profile(file),
         "thermometer" => with(vec![
             formed(point("temperature", register(Table::Input, 0, 1), Poll::Fast), tenths("°C")),
             point("strokes", register(Table::Input, 1, 2), Poll::Slow),
@@ -89,6 +91,13 @@ fn device(kind: &str) -> Device {
         }
         other => panic!("no kind of device is called `{other}`"),
     }
+}
+
+/// A device whose profile stands beside the transcripts.
+fn of_profile(file: &str) -> Device {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/transcripts").join(file);
+    let text = std::fs::read(&path).expect("a profile beside the transcripts");
+    Library::default().check(file, &text).unwrap_or_else(|faults| panic!("{faults:?}"))
 }
 
 /// Four relays as coils, what they do after a reset as bits in EEPROM, a watchdog, a reset button.

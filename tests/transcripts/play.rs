@@ -222,6 +222,12 @@ impl Player {
                 self.registers.insert((unit, Table::Holding, address), word);
                 Answer::Written
             }
+            Call::WriteCoils { address, values } => {
+                for (at, on) in (address..).zip(values) {
+                    self.registers.insert((unit, Table::Coil, at), u16::from(on));
+                }
+                Answer::Written
+            }
             other => panic!("devices do not answer {other} by themselves"),
         };
         self.reply(sent_at, Ok(answer));

@@ -1,11 +1,15 @@
 //! One device on the bus: whether it is there, what is known of it, what to ask it next.
 
+mod beats;
+mod fetching;
+mod obeying;
 mod patience;
 mod telling;
 mod wear;
 
 use crate::engine::address::Span;
-use crate::engine::command::{Outcome, OutcomeKind, words_of};
+use crate::engine::codec;
+use crate::engine::command::words_of;
 use crate::engine::device::{Device, Identify, Point, PointIndex};
 use crate::engine::health::Counters;
 use crate::engine::homeassistant::{self, Announcement};
@@ -17,7 +21,9 @@ use crate::engine::state::Values;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::Missing;
 
+use super::waiting::Target;
 use super::{Context, Severity};
+use beats::Beats;
 use patience::{FAILURES_UNTIL_OFFLINE, Patience};
 use wear::Wear;
 
@@ -55,7 +61,10 @@ pub(super) struct DeviceState {
     announcement_due: bool,
     /// A `get` or a command wants these told even if they have not changed.
     tell_anyway: Vec<PointIndex>,
-    warned_of_retained: Vec<PointIndex>,
+    warned_of_retained: Vec<Target>,
+    /// What each thing was last told to be, and when.
+    told_things: Vec<Option<(String, Time)>>,
+    beats: Beats,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -101,6 +110,8 @@ impl DeviceState {
             announcement_due: true,
             tell_anyway: Vec::new(),
             warned_of_retained: Vec::new(),
+            told_things: vec![None; settings.device.things.len()],
+            beats: Beats::new(&settings.device),
             settings,
         }
     }
@@ -127,50 +138,14 @@ impl DeviceState {
         self.served_at
     }
 
-    pub(super) fn point_named(&self, name: &str) -> Option<PointIndex> {
-        self.settings.device.points.iter().position(|point| point.name == name)
-    }
-
+    /// Whether its outputs fall to their safe state when nobody speaks to it, or writes to it.
     pub(super) fn has_watchdog(&self) -> bool {
-        self.settings.device.wire.watchdog.is_some()
+        let device = &self.settings.device;
+        device.wire.watchdog.is_some() || device.points.iter().any(|point| point.heartbeat.is_some())
     }
 
-    /// Whether a command to this point can begin: the device is there, is the right one, what decides
-    /// the point's meaning is known, and its EEPROM has been spared long enough.
-    pub(super) fn can_take(&self, now: Time, point: PointIndex) -> bool {
-        now >= self.writable_at(point)
-            && self.presence == Presence::Present
-            && self.patience.failures() == 0
-            && self.details(point).selectors().iter().all(|selector| self.known()[*selector].is_some())
-    }
-
-    /// From when on the point may be written, for its EEPROM's sake.
-    pub(super) fn writable_at(&self, point: PointIndex) -> Time {
-        if self.details(point).persistent { self.wear.allowed_at(point) } else { Time::default() }
-    }
-
-    /// Why a command to this point has not begun.
-    pub(super) fn why_not(&self, point: PointIndex) -> String {
-        match &self.presence {
-            Presence::Absent { reason } | Presence::Mismatch { reason } => reason.clone(),
-            Presence::Present => {
-                let unknown =
-                    self.details(point).selectors().into_iter().find(|at| self.known()[*at].is_none());
-                match unknown {
-                    Some(selector) => format!("waiting for {}", self.details(selector).name),
-                    None => "the device does not answer".to_string(),
-                }
-            }
-        }
-    }
-
-    /// Whether this is the first retained command seen for the point.
-    pub(super) fn warn_of_retained(&mut self, point: PointIndex) -> bool {
-        let first = !self.warned_of_retained.contains(&point);
-        if first {
-            self.warned_of_retained.push(point);
-        }
-        first
+    pub(super) fn is_present(&self) -> bool {
+        self.presence == Presence::Present
     }
 
     fn reason(&self) -> Option<String> {
@@ -327,6 +302,8 @@ impl DeviceState {
     fn disappear(&mut self, now: Time, context: &mut Context) {
         self.publish_availability(false, context);
         self.values.lose_all(Missing::Offline);
+        self.wake_reads();
+        self.beats.stop();
         self.tell_all(now, context);
         self.tell_info(context);
     }
@@ -366,7 +343,7 @@ impl DeviceState {
                 self.failed(now, &error, context);
             }
         }
-        self.after_news(context);
+        self.after_news(now, context);
     }
 
     /// The device answered a read with an exception: it is there, but will not tell this.
@@ -383,6 +360,7 @@ impl DeviceState {
             let reads = plan::plan(&self.settings.device, self.cost, &self.refused);
             let values = &self.values;
             self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
+            self.wake_reads();
             let text = format!(
                 "device {}: {} cannot be read in one request, and will be read in parts",
                 self.settings.name, read.span
@@ -403,7 +381,10 @@ impl DeviceState {
         for point in &absorbed.dropped {
             self.polls.want(*point);
             self.tell(now, *point, context);
+        }
+        if absorbed.decided {
             self.announcement_due = true;
+            self.wake_reads();
         }
         for (point, raw) in absorbed.unnamed {
             let name = &self.settings.device.points[point].name;
@@ -416,8 +397,16 @@ impl DeviceState {
         }
     }
 
+    /// Reads that hold only points which do not live now are not sent.
+    fn wake_reads(&mut self) {
+        let (device, known) = (&self.settings.device, self.values.known());
+        let sleeps = |point: PointIndex| codec::resolve(device, point, known) == Err(Missing::NotInThisMode);
+        self.polls.sleep(|read| read.points.iter().all(|(point, _)| sleeps(*point)));
+    }
+
     /// After a poll: what became complete with it is told.
-    fn after_news(&mut self, context: &mut Context) {
+    fn after_news(&mut self, now: Time, context: &mut Context) {
+        self.tell_things(now, context);
         if self.presence != Presence::Present {
             return;
         }
@@ -430,65 +419,6 @@ impl DeviceState {
                 self.tell_info(context);
             }
         }
-    }
-
-    // Commands.
-
-    /// A write to `point` goes out: what it decides is unknown until it has been read back.
-    pub(super) fn about_to_write(&mut self, now: Time, point: PointIndex, context: &mut Context) {
-        self.counters.writes += 1;
-        if self.details(point).persistent {
-            self.counters.persistent_writes += 1;
-            self.wear.spend(now, point);
-        }
-        if self.values.is_selector(point) {
-            self.values.forget_selector(&self.settings.device, point);
-            self.tell_all(now, context);
-        }
-    }
-
-    /// Words that a command has read at the point's own place.
-    pub(super) fn read_for_command(
-        &mut self,
-        now: Time,
-        point: PointIndex,
-        words: &[u16],
-        context: &mut Context,
-    ) {
-        let details = self.details(point);
-        if !details.is_read() {
-            return;
-        }
-        let (poll, span) = (details.poll, details.at.span);
-        let inside = self.settings.device.points.iter().enumerate();
-        let points = inside
-            .filter(|(_, other)| other.is_read() && span.contains(other.at.span))
-            .map(|(index, other)| (index, other.at))
-            .collect();
-        self.absorb(now, &Read { poll, span, points, alone: false }, words, context);
-    }
-
-    /// The command has ended: what it may have changed is read again, and told as it is.
-    pub(super) fn command_ended(
-        &mut self,
-        now: Time,
-        point: PointIndex,
-        outcome: &Outcome,
-        context: &mut Context,
-    ) {
-        for partner in self.details(point).re_read.clone() {
-            self.polls.want(partner);
-        }
-        if self.details(point).is_read() {
-            if matches!(outcome.kind, OutcomeKind::NoReply) {
-                self.want(point);
-            } else {
-                // Told even if unchanged, so that a switch flips back that was moved in vain.
-                self.tell_anyway.push(point);
-                self.tell(now, point, context);
-            }
-        }
-        self.after_news(context);
     }
 }
 

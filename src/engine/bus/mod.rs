@@ -1,15 +1,16 @@
 //! One bus as a state machine: what happened goes in, what to do comes out.
 //!
 //! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
-//! `ask_next` chooses the next: the command that has begun, then waiting commands, then whichever
-//! device's read (or identification) is most urgent.
+//! `ask_next` chooses the next: the command that has begun, heartbeats that are late, waiting commands,
+//! heartbeats, what somebody asked for, then whichever device's read (or identification) is most urgent.
 
+mod commands;
 mod device;
+mod fetch;
 mod waiting;
 
 use std::collections::VecDeque;
 
-use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
 use crate::engine::homeassistant::Gateway;
@@ -19,8 +20,10 @@ use crate::engine::settings::{Link, OnBrokerLoss, Settings};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
+use commands::Active;
 use device::{DeviceState, Polled};
-use waiting::{Waiting, WaitingCommands};
+use fetch::Fetch;
+use waiting::{Target, WaitingCommands};
 
 /// After so many requests in a row that nobody answers, a TCP connection is made anew.
 const UNANSWERED_UNTIL_RENEWED: u32 = 5;
@@ -90,8 +93,14 @@ pub struct Bus {
     context: Context,
     devices: Vec<DeviceState>,
     waiting: WaitingCommands,
-    /// The command that has begun, and its device.
-    active: Option<(usize, CommandFlow)>,
+    /// The command that has begun.
+    active: Option<Active>,
+    /// Commands that were written and wait until they can be read back.
+    settling: Vec<(Time, Active)>,
+    /// What was read for a heartbeat, and is written before anything else is asked.
+    beat: Option<(usize, PointIndex, Call)>,
+    /// Points that are read only because somebody asked for them.
+    fetches: VecDeque<Fetch>,
     in_flight: Option<InFlight>,
     link_state: LinkState,
     /// Requests in a row that no device on this link answered.
@@ -142,8 +151,14 @@ struct InFlight {
 
 enum Purpose {
     Identify,
-    Poll { read: usize },
+    Poll {
+        read: usize,
+    },
     Command,
+    Fetch,
+    /// Reads what the heartbeat repeats.
+    BeatRead(PointIndex),
+    BeatWrite(PointIndex),
 }
 
 impl Bus {
@@ -174,6 +189,9 @@ impl Bus {
             devices,
             waiting: WaitingCommands::default(),
             active: None,
+            settling: Vec::new(),
+            beat: None,
+            fetches: VecDeque::new(),
             in_flight: None,
             link_state: LinkState::Down { reason: None, attempts: 0 },
             unanswered: 0,
@@ -221,8 +239,15 @@ impl Bus {
         let of_devices =
             self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
         let spared =
-            self.waiting.iter().map(|waiting| self.devices[waiting.device].writable_at(waiting.point));
-        of_devices.chain(self.waiting.next_deadline()).chain(spared.filter(|at| *at > self.now)).min()
+            self.waiting.iter().map(|waiting| self.devices[waiting.device].writable_at(waiting.target));
+        let beats =
+            self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::beats_at);
+        of_devices
+            .chain(self.waiting.next_deadline())
+            .chain(spared.filter(|at| *at > self.now))
+            .chain(self.settled_at())
+            .chain(beats)
+            .min()
     }
 
     /// Whether a shutdown has been asked for and nothing is in flight any more.
@@ -274,6 +299,9 @@ impl Bus {
         if let Some(in_flight) = self.in_flight.take() {
             self.request_ended(in_flight, Err(RequestError::Link(reason.clone())));
         }
+        self.beat = None;
+        self.fetches.clear();
+        self.end_settling(&format!("written, but not read back: the link is down: {reason}"));
         for device in &mut self.devices {
             device.lose(self.now, &format!("the link is down: {reason}"), &mut self.context);
         }
@@ -312,86 +340,48 @@ impl Bus {
         match in_flight.purpose {
             Purpose::Identify => device.identified(self.now, result, &mut self.context),
             Purpose::Poll { read } => device.polled(self.now, read, result, &mut self.context),
-            Purpose::Command => self.command_answered(in_flight.device, result),
+            Purpose::Command => self.command_answered(result),
+            Purpose::Fetch => self.fetched(result),
+            Purpose::BeatRead(point) => {
+                let call = device.beat_read(self.now, point, &result, &mut self.context);
+                self.beat = call.map(|call| (in_flight.device, point, call));
+            }
+            Purpose::BeatWrite(point) => {
+                self.counters.writes += 1;
+                device.beat_written(self.now, point, &result, &mut self.context);
+            }
         }
     }
 
     // What somebody wants.
 
-    fn command(&mut self, command: Command) {
-        let Some((device, point)) = self.find(&command.device, &command.point) else { return };
-        if command.retained {
-            if self.devices[device].warn_of_retained(point) {
-                let topic = self.context.gateway.topics.set(&command.device, &command.point);
-                self.context
-                    .say(Severity::Warning, format!("a retained message on `{topic}` is ignored; delete it"));
+    fn get(&mut self, device: &str, name: &str) {
+        match self.find(device, name) {
+            Some((device, Target::Point(point)))
+                if self.devices[device].details(point).is_read_on_request() =>
+            {
+                self.fetch(device, point);
             }
-            return;
-        }
-        let waiting =
-            Waiting::new(self.now, device, point, command.payload, self.devices[device].details(point));
-        for (replaced, reason) in self.waiting.push(waiting) {
-            self.end_command(
-                replaced.device,
-                replaced.point,
-                Outcome::new(OutcomeKind::Expired, &replaced.wanted, reason),
-            );
+            Some((device, Target::Point(point))) => self.devices[device].want(point),
+            Some((device, Target::Thing(thing))) => self.devices[device].want_thing(thing),
+            None => {}
         }
     }
 
-    fn get(&mut self, device: &str, point: &str) {
-        if let Some((device, point)) = self.find(device, point) {
-            self.devices[device].want(point);
-        }
-    }
-
-    fn find(&self, device: &str, point: &str) -> Option<(usize, PointIndex)> {
+    fn find(&self, device: &str, name: &str) -> Option<(usize, Target)> {
         let index = self.devices.iter().position(|state| state.name() == device)?;
-        Some((index, self.devices[index].point_named(point)?))
-    }
-
-    fn expire_commands(&mut self) {
-        for mut waiting in self.waiting.take_expired(self.now) {
-            let device = &self.devices[waiting.device];
-            let writable_at = device.writable_at(waiting.point);
-            if writable_at > self.now {
-                // A write that had begun before it has put it off.
-                waiting.put_off(writable_at, device.details(waiting.point));
-                self.waiting.push(waiting);
-                continue;
-            }
-            let reason = self.devices[waiting.device].why_not(waiting.point);
-            self.end_command(
-                waiting.device,
-                waiting.point,
-                Outcome::new(OutcomeKind::Expired, &waiting.wanted, reason),
-            );
-        }
-    }
-
-    fn refuse_what_waits(&mut self) {
-        for waiting in self.waiting.take_all() {
-            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, "busker stops");
-            self.end_command(waiting.device, waiting.point, outcome);
-        }
-        if self.in_flight.is_none() {
-            for device in &mut self.devices {
-                device.say_offline(&mut self.context);
-            }
-        }
-    }
-
-    fn end_command(&mut self, device: usize, point: PointIndex, outcome: Outcome) {
-        let state = &self.devices[device];
-        let topic = self.context.gateway.topics.outcome(state.name(), &state.details(point).name);
-        self.context.publish(Message::once(topic, outcome.to_json()));
+        Some((index, self.devices[index].target_named(name)?))
     }
 
     // What to ask next.
 
     fn ask_next(&mut self) {
         while self.in_flight.is_none() && self.link_state == LinkState::Up {
-            if self.begin_command() {
+            if let Some((device, point, call)) = self.beat.take() {
+                self.send(device, call, Purpose::BeatWrite(point));
+                continue;
+            }
+            if self.begin_beat(true) || self.begin_command() || self.begin_beat(false) || self.next_fetch() {
                 continue;
             }
             let now = self.now;
@@ -413,58 +403,20 @@ impl Bus {
         }
     }
 
-    /// A device whose watchdog must run out is not spoken to while the broker is away.
-    fn may_ask(&self, device: &DeviceState) -> bool {
-        self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog()
-    }
-
-    /// Begins the first waiting command whose device can take it. Whether anything was done.
-    fn begin_command(&mut self) -> bool {
-        if self.active.is_some() {
-            return false;
-        }
-        let devices = &self.devices;
+    /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.
+    fn begin_beat(&mut self, late: bool) -> bool {
         let now = self.now;
-        let can_begin = |waiting: &Waiting| devices[waiting.device].can_take(now, waiting.point);
-        let Some(waiting) = self.waiting.take_first(can_begin) else {
-            return false;
-        };
-        let state = &mut self.devices[waiting.device];
-        let (flow, step) = CommandFlow::begin(state.device(), waiting.point, &waiting.wanted, state.known());
-        self.active = flow.map(|flow| (waiting.device, flow));
-        self.take_step(waiting.device, waiting.point, step);
+        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+        let due = devices.find_map(|(index, device)| Some((index, device.beat_due(now, late)?)));
+        let Some((device, point)) = due else { return false };
+        let call = Call::Read(self.devices[device].details(point).at.span);
+        self.send(device, call, Purpose::BeatRead(point));
         true
     }
 
-    fn command_answered(&mut self, device: usize, result: Result<Answer, RequestError>) {
-        let Some((_, mut flow)) = self.active.take() else { return };
-        let point = flow.point();
-        if let (true, Ok(answer)) = (flow.reads(), &result) {
-            let words = command::words_of(answer);
-            self.devices[device].read_for_command(self.now, point, &words, &mut self.context);
-        }
-        let step = flow.answered(self.devices[device].device(), self.devices[device].known(), &result);
-        self.active = Some((device, flow));
-        self.take_step(device, point, step);
-    }
-
-    fn take_step(&mut self, device: usize, point: PointIndex, step: Step) {
-        match step {
-            Step::Ask(call) => {
-                if call.is_write() {
-                    let persistent = self.devices[device].details(point).persistent;
-                    self.counters.writes += 1;
-                    self.counters.persistent_writes += u64::from(persistent);
-                    self.devices[device].about_to_write(self.now, point, &mut self.context);
-                }
-                self.send(device, call, Purpose::Command);
-            }
-            Step::Finished(outcome) => {
-                self.active = None;
-                self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
-                self.end_command(device, point, outcome);
-            }
-        }
+    /// A device whose watchdog must run out is not spoken to while the broker is away.
+    fn may_ask(&self, device: &DeviceState) -> bool {
+        self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog()
     }
 
     fn send(&mut self, device: usize, call: Call, purpose: Purpose) {

@@ -1,15 +1,24 @@
 //! Commands that wait for their turn: bounded, the newest value of a point wins, none waits for ever.
 
-use crate::engine::device::{Point, PointIndex, WriteRule};
+use crate::engine::device::PointIndex;
 use crate::engine::time::{Duration, Time};
+
+/// What a command is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Target {
+    Point(PointIndex),
+    /// An index into the device's things.
+    Thing(usize),
+}
 
 /// A command that has not begun.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Waiting {
     pub device: usize,
-    pub point: PointIndex,
+    pub target: Target,
     pub wanted: String,
     pub deadline: Time,
+    is_press: bool,
 }
 
 impl Waiting {
@@ -19,22 +28,20 @@ impl Waiting {
     const PRESS_TIME_TO_LIVE: Duration = Duration::from_secs(3);
 
     /// A command that may begin at `from`.
-    pub fn new(from: Time, device: usize, point: PointIndex, wanted: String, details: &Point) -> Waiting {
-        Waiting { device, point, wanted, deadline: from + Waiting::time_to_live(details) }
+    pub fn new(from: Time, device: usize, target: Target, wanted: String, is_press: bool) -> Waiting {
+        let mut waiting = Waiting { device, target, wanted, deadline: from, is_press };
+        waiting.put_off(from);
+        waiting
     }
 
     /// Puts the deadline off, for a command that may not begin before `from`.
-    pub fn put_off(&mut self, from: Time, details: &Point) {
-        self.deadline = from + Waiting::time_to_live(details);
-    }
-
-    fn time_to_live(details: &Point) -> Duration {
-        let press = details.write.as_ref().is_some_and(|write| matches!(write.rule, WriteRule::Press { .. }));
-        if press { Waiting::PRESS_TIME_TO_LIVE } else { Waiting::TIME_TO_LIVE }
+    pub fn put_off(&mut self, from: Time) {
+        let time_to_live = if self.is_press { Waiting::PRESS_TIME_TO_LIVE } else { Waiting::TIME_TO_LIVE };
+        self.deadline = from + time_to_live;
     }
 }
 
-/// First come, first served; one value for each point.
+/// First come, first served; one value for each point or thing.
 #[derive(Debug, Default)]
 pub struct WaitingCommands {
     queue: Vec<Waiting>,
@@ -47,7 +54,7 @@ impl WaitingCommands {
     /// Adds a command; returns those that it displaces, and why.
     pub fn push(&mut self, command: Waiting) -> Vec<(Waiting, &'static str)> {
         let mut displaced = Vec::new();
-        let same = |other: &Waiting| other.device == command.device && other.point == command.point;
+        let same = |other: &Waiting| other.device == command.device && other.target == command.target;
         if let Some(at) = self.queue.iter().position(same) {
             displaced.push((std::mem::replace(&mut self.queue[at], command), "a newer value took its place"));
             return displaced;

@@ -4,12 +4,12 @@
 use serde_json::json;
 
 use crate::engine::codec;
-use crate::engine::device::PointIndex;
+use crate::engine::device::{PointIndex, Thing};
 use crate::engine::health::{DeviceReport, PointReport};
 use crate::engine::homeassistant;
 use crate::engine::time::Time;
 use crate::engine::topics::{Message, OFFLINE, ONLINE};
-use crate::engine::value::Reading;
+use crate::engine::value::{Missing, Reading};
 
 use super::{Context, DeviceState, Presence};
 
@@ -18,11 +18,19 @@ impl DeviceState {
         for point in 0..self.settings.device.points.len() {
             self.tell(now, point, context);
         }
+        self.tell_things(now, context);
     }
 
     pub(super) fn tell(&mut self, now: Time, point: PointIndex, context: &mut Context) {
         let details = &self.settings.device.points[point];
-        if !details.is_read() {
+        if details.is_button() {
+            return;
+        }
+        if let Some(event) = &details.event {
+            if self.values.take_flip(now, point) {
+                let topic = context.gateway.topics.state(&self.settings.name, &details.name);
+                context.publish(Message::once(topic, json!({"event_type": event}).to_string()));
+            }
             return;
         }
         let anyway = self.tell_anyway.contains(&point);
@@ -30,6 +38,44 @@ impl DeviceState {
         if let Some(text) = self.values.tell(now, point, details, context.republish, anyway) {
             let topic = context.gateway.topics.state(&self.settings.name, &details.name);
             context.publish(Message::retained(topic, text));
+        }
+    }
+
+    /// What things are follows from what their points say.
+    pub(super) fn tell_things(&mut self, now: Time, context: &mut Context) {
+        for (index, thing) in self.settings.device.things.iter().enumerate() {
+            if thing.states.is_empty() {
+                continue;
+            }
+            let text = self.state_of(thing).unwrap_or("None");
+            let told = &mut self.told_things[index];
+            let is_told = |(before, at): &(String, Time)| before == text && now - *at < context.republish;
+            if !told.as_ref().is_some_and(is_told) {
+                *told = Some((text.to_string(), now));
+                let topic = context.gateway.topics.state(&self.settings.name, &thing.name);
+                context.publish(Message::retained(topic, text));
+            }
+        }
+    }
+
+    /// The first of the thing's states whose row holds; `None` if none does, or if it does not live.
+    fn state_of<'t>(&self, thing: &'t Thing) -> Option<&'t str> {
+        if codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
+            return None;
+        }
+        let says = |(point, text): &(PointIndex, String)| match self.values.reading(*point) {
+            Reading::Missing(_) => false,
+            reading => reading.to_string() == *text,
+        };
+        thing.states.iter().find(|state| state.row.iter().all(says)).map(|state| state.name.as_str())
+    }
+
+    /// The thing is told again even if it has not changed.
+    pub(in crate::engine::bus) fn want_thing(&mut self, thing: usize) {
+        self.told_things[thing] = None;
+        let states = &self.settings.device.things[thing].states;
+        for point in states.iter().flat_map(|state| &state.row).map(|(point, _)| *point) {
+            self.polls.want(point);
         }
     }
 
@@ -61,6 +107,9 @@ impl DeviceState {
         if next.is_empty() && self.announced.is_none() {
             return;
         }
+        if self.announced.as_ref() == Some(&next) {
+            return;
+        }
         if let Some(previous) = self.announced.take() {
             if let Some(farewell) = homeassistant::farewell(&previous, &next) {
                 context.publish(farewell);
@@ -77,8 +126,10 @@ impl DeviceState {
             .points
             .iter()
             .enumerate()
-            .filter(|(_, point)| point.is_read())
+            .filter(|(_, point)| !point.is_button())
             .filter_map(|(index, point)| match self.values.reading(index) {
+                // Nobody has asked for it.
+                Reading::Missing(Missing::NotYetRead) if point.is_read_on_request() => None,
                 Reading::Missing(missing) if self.presence == Presence::Present => {
                     Some((point.name.clone(), missing.to_string().into()))
                 }
@@ -106,7 +157,7 @@ impl DeviceState {
     }
 
     pub(in crate::engine::bus) fn report(&self) -> DeviceReport {
-        let points = self.settings.device.points.iter().enumerate().filter(|(_, point)| point.is_read());
+        let points = self.settings.device.points.iter().enumerate().filter(|(_, point)| !point.is_button());
         DeviceReport {
             name: self.settings.name.clone(),
             title: self.settings.title.clone(),

@@ -1,0 +1,203 @@
+//! Commands on a bus: they wait, begin, are written, settle, are read back, and end in exactly one
+//! outcome. A thing's command is the commands of its points, one after the other.
+
+use std::collections::VecDeque;
+
+use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
+use crate::engine::device::PointIndex;
+use crate::engine::modbus::{Answer, RequestError};
+use crate::engine::time::Time;
+use crate::engine::topics::Message;
+
+use super::waiting::{Target, Waiting};
+use super::{Bus, Command, Purpose, Severity};
+
+/// A command that has begun.
+pub(super) struct Active {
+    device: usize,
+    target: Target,
+    wanted: String,
+    flow: CommandFlow,
+    /// What of a thing's command is still to be written.
+    orders: VecDeque<(PointIndex, String)>,
+}
+
+impl Bus {
+    /// A message on a `set` topic.
+    pub(super) fn command(&mut self, command: Command) {
+        let Some((device, target)) = self.find(&command.device, &command.point) else { return };
+        if command.retained {
+            if self.devices[device].warn_of_retained(target) {
+                let topic = self.context.gateway.topics.set(&command.device, &command.point);
+                self.context
+                    .say(Severity::Warning, format!("a retained message on `{topic}` is ignored; delete it"));
+            }
+            return;
+        }
+        let is_press = self.devices[device].is_press(target);
+        let waiting = Waiting::new(self.now, device, target, command.payload, is_press);
+        for (replaced, reason) in self.waiting.push(waiting) {
+            let outcome = Outcome::new(OutcomeKind::Expired, &replaced.wanted, reason);
+            self.tell_outcome(replaced.device, replaced.target, outcome);
+        }
+    }
+
+    pub(super) fn expire_commands(&mut self) {
+        for mut waiting in self.waiting.take_expired(self.now) {
+            let device = &self.devices[waiting.device];
+            let writable_at = device.writable_at(waiting.target);
+            if writable_at > self.now {
+                // A write that had begun before it has put it off.
+                waiting.put_off(writable_at);
+                self.waiting.push(waiting);
+                continue;
+            }
+            let reason = device.why_not(waiting.target);
+            let outcome = Outcome::new(OutcomeKind::Expired, &waiting.wanted, reason);
+            self.tell_outcome(waiting.device, waiting.target, outcome);
+        }
+    }
+
+    pub(super) fn refuse_what_waits(&mut self) {
+        for waiting in self.waiting.take_all() {
+            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, "busker stops");
+            self.tell_outcome(waiting.device, waiting.target, outcome);
+        }
+        self.end_settling("written, but not read back: busker stops");
+        if self.in_flight.is_none() {
+            for device in &mut self.devices {
+                device.say_offline(&mut self.context);
+            }
+        }
+    }
+
+    /// Nothing can be read back any more.
+    pub(super) fn end_settling(&mut self, reason: &str) {
+        for (_, active) in std::mem::take(&mut self.settling) {
+            let outcome = Outcome::new(OutcomeKind::NoReply, &active.wanted, reason);
+            self.end_command(active, outcome);
+        }
+    }
+
+    /// Goes on with a command that has settled, or begins the first waiting one whose device can take
+    /// it. Whether anything was done.
+    pub(super) fn begin_command(&mut self) -> bool {
+        if self.active.is_some() {
+            return false;
+        }
+        if let Some(at) = self.settling.iter().position(|(at, _)| *at <= self.now) {
+            let (_, mut active) = self.settling.remove(at);
+            let call = active.flow.settled(self.devices[active.device].device());
+            let device = active.device;
+            self.active = Some(active);
+            self.send(device, call, Purpose::Command);
+            return true;
+        }
+        let (devices, settling, now) = (&self.devices, &self.settling, self.now);
+        let is_settling = |device: usize, point: PointIndex| {
+            settling.iter().any(|(_, active)| active.device == device && active.flow.point() == point)
+        };
+        let can_begin = |waiting: &Waiting| {
+            let device = &devices[waiting.device];
+            device.can_take(now, waiting.target)
+                && !device.written_by(waiting.target).iter().any(|point| is_settling(waiting.device, *point))
+        };
+        let Some(waiting) = self.waiting.take_first(can_begin) else { return false };
+        let Waiting { device, target, wanted, .. } = waiting;
+        let orders = match target {
+            Target::Point(point) => VecDeque::from([(point, wanted.clone())]),
+            Target::Thing(thing) => match self.devices[device].orders(thing, &wanted) {
+                Ok(orders) => orders.into(),
+                Err(reason) => {
+                    self.tell_outcome(device, target, Outcome::new(OutcomeKind::Refused, &wanted, reason));
+                    return true;
+                }
+            },
+        };
+        self.begin_order(device, target, wanted, orders);
+        true
+    }
+
+    /// Begins the first of `orders`, which there is.
+    fn begin_order(
+        &mut self,
+        device: usize,
+        target: Target,
+        wanted: String,
+        mut orders: VecDeque<(PointIndex, String)>,
+    ) {
+        let Some((point, value)) = orders.pop_front() else { return };
+        let state = &self.devices[device];
+        match CommandFlow::begin(state.device(), point, &value, state.known()) {
+            (Some(flow), step) => self.take_step(Active { device, target, wanted, flow, orders }, step),
+            (None, Step::Finished(outcome)) => {
+                self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
+                self.tell_outcome(device, target, of_target(target, wanted, outcome));
+            }
+            (None, Step::Ask(_) | Step::Settle(_)) => {}
+        }
+    }
+
+    pub(super) fn command_answered(&mut self, result: Result<Answer, RequestError>) {
+        let Some(mut active) = self.active.take() else { return };
+        let state = &mut self.devices[active.device];
+        if let (true, Ok(answer)) = (active.flow.reads(), &result) {
+            let words = command::words_of(answer);
+            state.read_for_command(self.now, active.flow.point(), &words, &mut self.context);
+        }
+        let step = active.flow.answered(state.device(), state.known(), &result);
+        self.take_step(active, step);
+    }
+
+    fn take_step(&mut self, active: Active, step: Step) {
+        let (device, point) = (active.device, active.flow.point());
+        match step {
+            Step::Ask(call) => {
+                if call.is_write() {
+                    let persistent = self.devices[device].details(point).persistent;
+                    self.counters.writes += 1;
+                    self.counters.persistent_writes += u64::from(persistent);
+                    self.devices[device].about_to_write(self.now, point, &mut self.context);
+                }
+                self.active = Some(active);
+                self.send(device, call, Purpose::Command);
+            }
+            Step::Settle(time) => self.settling.push((self.now + time, active)),
+            Step::Finished(outcome) => {
+                let is_done = matches!(outcome.kind, OutcomeKind::Done | OutcomeKind::Unchanged);
+                if is_done && !active.orders.is_empty() {
+                    self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
+                    let Active { target, wanted, orders, .. } = active;
+                    self.begin_order(device, target, wanted, orders);
+                } else {
+                    self.end_command(active, outcome);
+                }
+            }
+        }
+    }
+
+    fn end_command(&mut self, active: Active, outcome: Outcome) {
+        let Active { device, target, wanted, flow, .. } = active;
+        self.devices[device].command_ended(self.now, flow.point(), &outcome, &mut self.context);
+        self.tell_outcome(device, target, of_target(target, wanted, outcome));
+    }
+
+    fn tell_outcome(&mut self, device: usize, target: Target, outcome: Outcome) {
+        let state = &self.devices[device];
+        let topic = self.context.gateway.topics.outcome(state.name(), state.name_of(target));
+        self.context.publish(Message::once(topic, outcome.to_json()));
+    }
+
+    /// When the next command that was written can be read back.
+    pub(super) fn settled_at(&self) -> Option<Time> {
+        self.settling.iter().map(|(at, _)| *at).min()
+    }
+}
+
+/// A thing's outcome names what was wanted of the thing, and holds what its last point answered.
+fn of_target(target: Target, wanted: String, outcome: Outcome) -> Outcome {
+    match target {
+        Target::Point(_) => outcome,
+        Target::Thing(_) => Outcome { wanted, ..outcome },
+    }
+}

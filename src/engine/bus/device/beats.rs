@@ -1,0 +1,146 @@
+//! Heartbeats: registers that must be written again and again, or the device acts on the silence.
+//!
+//! What is written is what was read from the register just before, so that no older order comes back
+//! and nobody's wish is made true by it.
+
+use crate::engine::codec::{self, Resolved};
+use crate::engine::command::{words_of, write_call};
+use crate::engine::device::{Device, PointIndex};
+use crate::engine::modbus::{Answer, Call, RequestError};
+use crate::engine::time::{Duration, Time};
+use crate::engine::value::{Decimal, Reading};
+
+use super::{Context, DeviceState, Presence, Severity};
+
+/// So many times within the time that the device allows a heartbeat is due.
+const WITHIN: u32 = 3;
+
+/// The registers of one device that want to be written.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Beats {
+    list: Vec<Beat>,
+}
+
+#[derive(Clone, Debug)]
+struct Beat {
+    point: PointIndex,
+    /// The point with the longest time between two writes.
+    time: PointIndex,
+    /// When the last one was tried; `None`: never since the device came.
+    tried_at: Option<Time>,
+    /// Said once: the device does not take it.
+    is_refused: bool,
+}
+
+impl Beats {
+    pub(super) fn new(device: &Device) -> Beats {
+        let beat = |(point, details): (PointIndex, &crate::engine::device::Point)| {
+            Some(Beat { point, time: details.heartbeat?, tried_at: None, is_refused: false })
+        };
+        Beats { list: device.points.iter().enumerate().filter_map(beat).collect() }
+    }
+
+    /// The device is gone; when it comes back its time runs anew.
+    pub(super) fn stop(&mut self) {
+        self.list.iter_mut().for_each(|beat| beat.tried_at = None);
+    }
+}
+
+impl DeviceState {
+    /// The heartbeat that is due now; with `late`, only one that has been due for as long again.
+    pub(in crate::engine::bus) fn beat_due(&self, now: Time, late: bool) -> Option<PointIndex> {
+        let due = |beat: &&Beat| {
+            let Some(interval) = self.interval_of(beat) else { return false };
+            let Some(tried_at) = beat.tried_at else { return true };
+            now >= tried_at + interval * if late { 2 } else { 1 }
+        };
+        self.beats.list.iter().find(due).map(|beat| beat.point)
+    }
+
+    /// When the next heartbeat is due.
+    pub(in crate::engine::bus) fn beats_at(&self) -> Option<Time> {
+        let at = |beat: &Beat| {
+            let interval = self.interval_of(beat)?;
+            Some(beat.tried_at.map_or(Time::default(), |tried_at| tried_at + interval))
+        };
+        self.beats.list.iter().filter_map(at).min()
+    }
+
+    /// `None` while no heartbeat is wanted: the device is away or does not answer, the register has no
+    /// meaning in this mode, its time is not known, or 0.
+    fn interval_of(&self, beat: &Beat) -> Option<Duration> {
+        if self.presence != Presence::Present || self.patience.failures() > 0 {
+            return None;
+        }
+        codec::resolve(self.device(), beat.point, self.known()).ok()?;
+        let resolved = codec::resolve(self.device(), beat.time, self.known()).ok()?;
+        let seconds = codec::to_unit(&resolved, self.known()[beat.time]?)?;
+        let micros = seconds.checked_mul(Decimal::integer(1_000_000))?.to_f64();
+        let time = Duration::from_micros(micros.max(0.0) as u64);
+        (!time.is_zero()).then_some(time / WITHIN)
+    }
+
+    /// The register has been read: the write that repeats it, if it holds anything to repeat.
+    pub(in crate::engine::bus) fn beat_read(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        result: &Result<Answer, RequestError>,
+        context: &mut Context,
+    ) -> Option<Call> {
+        self.beat_tried(now, point);
+        let answer = match result {
+            Ok(answer) => answer,
+            Err(error) => {
+                self.beat_failed(now, point, error, context);
+                return None;
+            }
+        };
+        let words = words_of(answer);
+        self.read_beside(now, self.details(point).at.span, &words, context);
+        let details = self.details(point);
+        let field = codec::words_at(details.at, details.at.span.first(), &words)?;
+        let resolved: Resolved<'_> = codec::resolve(self.device(), point, self.known()).ok()?;
+        if let Reading::Missing(_) = codec::read(&resolved, &field) {
+            return None;
+        }
+        Some(write_call(details.write.as_ref()?, &field))
+    }
+
+    pub(in crate::engine::bus) fn beat_written(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        result: &Result<Answer, RequestError>,
+        context: &mut Context,
+    ) {
+        self.counters.writes += 1;
+        match result {
+            Ok(_) => {
+                if let Some(beat) = self.beats.list.iter_mut().find(|beat| beat.point == point) {
+                    beat.is_refused = false;
+                }
+            }
+            Err(error) => self.beat_failed(now, point, error, context),
+        }
+    }
+
+    fn beat_tried(&mut self, now: Time, point: PointIndex) {
+        if let Some(beat) = self.beats.list.iter_mut().find(|beat| beat.point == point) {
+            beat.tried_at = Some(now);
+        }
+    }
+
+    fn beat_failed(&mut self, now: Time, point: PointIndex, error: &RequestError, context: &mut Context) {
+        if !matches!(error, RequestError::Exception(_)) {
+            self.failed(now, error, context);
+            return;
+        }
+        let name = format!("{}: {}", self.settings.name, self.details(point).name);
+        let Some(beat) = self.beats.list.iter_mut().find(|beat| beat.point == point) else { return };
+        if !std::mem::replace(&mut beat.is_refused, true) {
+            let text = format!("device {name}: the heartbeat fails: {error}; the device will act on it");
+            context.say(Severity::Warning, text);
+        }
+    }
+}

@@ -1,0 +1,180 @@
+//! What a device does with commands: which it can take, what is asked for them, and what follows.
+
+use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::device::PointIndex;
+use crate::engine::plan::Read;
+use crate::engine::time::Time;
+
+use super::{Context, DeviceState, Presence, Target};
+
+impl DeviceState {
+    pub(in crate::engine::bus) fn target_named(&self, name: &str) -> Option<Target> {
+        let device = &self.settings.device;
+        let point = device.points.iter().position(|point| point.name == name).map(Target::Point);
+        point.or_else(|| device.things.iter().position(|thing| thing.name == name).map(Target::Thing))
+    }
+
+    pub(in crate::engine::bus) fn name_of(&self, target: Target) -> &str {
+        match target {
+            Target::Point(point) => &self.settings.device.points[point].name,
+            Target::Thing(thing) => &self.settings.device.things[thing].name,
+        }
+    }
+
+    pub(in crate::engine::bus) fn is_press(&self, target: Target) -> bool {
+        match target {
+            Target::Point(point) => self.details(point).is_button(),
+            Target::Thing(thing) => self.settings.device.things[thing].states.is_empty(),
+        }
+    }
+
+    /// The points that a command to `target` may write.
+    pub(in crate::engine::bus) fn written_by(&self, target: Target) -> Vec<PointIndex> {
+        match target {
+            Target::Point(point) => vec![point],
+            Target::Thing(thing) => {
+                let commands = &self.settings.device.things[thing].commands;
+                commands.iter().flat_map(|command| &command.orders).map(|(point, _)| *point).collect()
+            }
+        }
+    }
+
+    /// What is written when the thing is told `wanted`; an error is the rule that this breaks.
+    pub(in crate::engine::bus) fn orders(
+        &self,
+        thing: usize,
+        wanted: &str,
+    ) -> Result<Vec<(PointIndex, String)>, String> {
+        let thing = &self.settings.device.things[thing];
+        if crate::engine::codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
+            return Err(format!("`{}` does not exist in the present mode of the device", thing.name));
+        }
+        match thing.command(wanted) {
+            Some(command) => Ok(command.orders.clone()),
+            None => {
+                let known: Vec<String> =
+                    thing.commands.iter().map(|command| format!("`{}`", command.name)).collect();
+                Err(format!("`{wanted}` is none of {}", known.join(", ")))
+            }
+        }
+    }
+
+    /// Whether a command can begin: the device is there, is the right one, what decides about the points
+    /// is known, and their EEPROM has been spared long enough.
+    pub(in crate::engine::bus) fn can_take(&self, now: Time, target: Target) -> bool {
+        now >= self.writable_at(target)
+            && self.presence == Presence::Present
+            && self.patience.failures() == 0
+            && self.unknown_selector(target).is_none()
+    }
+
+    fn unknown_selector(&self, target: Target) -> Option<PointIndex> {
+        let of_points = self.written_by(target).into_iter().flat_map(|point| self.details(point).selectors());
+        let of_thing = match target {
+            Target::Point(_) => None,
+            Target::Thing(thing) => Some(self.settings.device.things[thing].when.iter()),
+        };
+        let of_thing = of_thing.into_iter().flatten().map(|condition| condition.point);
+        of_thing.chain(of_points).find(|selector| self.known()[*selector].is_none())
+    }
+
+    /// From when on all that is written may be written, for its EEPROM's sake.
+    pub(in crate::engine::bus) fn writable_at(&self, target: Target) -> Time {
+        let written = self.written_by(target).into_iter().filter(|point| self.details(*point).persistent);
+        written.map(|point| self.wear.allowed_at(point)).max().unwrap_or_default()
+    }
+
+    /// Why a command has not begun.
+    pub(in crate::engine::bus) fn why_not(&self, target: Target) -> String {
+        match &self.presence {
+            Presence::Absent { reason } | Presence::Mismatch { reason } => reason.clone(),
+            Presence::Present => match self.unknown_selector(target) {
+                Some(selector) => format!("waiting for {}", self.details(selector).name),
+                None => "the device does not answer".to_string(),
+            },
+        }
+    }
+
+    /// Whether this is the first retained command seen for the target.
+    pub(in crate::engine::bus) fn warn_of_retained(&mut self, target: Target) -> bool {
+        let first = !self.warned_of_retained.contains(&target);
+        if first {
+            self.warned_of_retained.push(target);
+        }
+        first
+    }
+
+    /// A write to `point` goes out: what it decides is unknown until it has been read back.
+    pub(in crate::engine::bus) fn about_to_write(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        context: &mut Context,
+    ) {
+        self.counters.writes += 1;
+        if self.details(point).persistent {
+            self.counters.persistent_writes += 1;
+            self.wear.spend(now, point);
+        }
+        if self.values.is_selector(point) {
+            self.values.forget_selector(&self.settings.device, point);
+            self.wake_reads();
+            self.tell_all(now, context);
+        }
+    }
+
+    /// Words that a command has read at the point's own place.
+    pub(in crate::engine::bus) fn read_for_command(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        words: &[u16],
+        context: &mut Context,
+    ) {
+        if self.details(point).is_read() {
+            self.read_beside(now, self.details(point).at.span, words, context);
+        }
+    }
+
+    /// Words that were read at `span` for another purpose than a poll: they are news for every polled
+    /// point in it.
+    pub(in crate::engine::bus) fn read_beside(
+        &mut self,
+        now: Time,
+        span: crate::engine::address::Span,
+        words: &[u16],
+        context: &mut Context,
+    ) {
+        let inside = self.settings.device.points.iter().enumerate();
+        let points: Vec<_> = inside
+            .filter(|(_, other)| other.is_read() && span.contains(other.at.span))
+            .map(|(index, other)| (index, other.at))
+            .collect();
+        let Some((first, _)) = points.first() else { return };
+        let poll = self.details(*first).poll;
+        self.absorb(now, &Read { poll, span, points, alone: false }, words, context);
+    }
+
+    /// The command has ended: what it may have changed is read again, and told as it is.
+    pub(in crate::engine::bus) fn command_ended(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        outcome: &Outcome,
+        context: &mut Context,
+    ) {
+        for partner in self.details(point).re_read.clone() {
+            self.polls.want(partner);
+        }
+        if self.details(point).is_read() {
+            if matches!(outcome.kind, OutcomeKind::NoReply) {
+                self.want(point);
+            } else {
+                // Told even if unchanged, so that a switch flips back that was moved in vain.
+                self.tell_anyway.push(point);
+                self.tell(now, point, context);
+            }
+        }
+        self.after_news(now, context);
+    }
+}
