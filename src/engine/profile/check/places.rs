@@ -109,9 +109,14 @@ impl Rules<'_, '_> {
                     (false, false) => (limits.write_registers, "registers", "write_registers"),
                 };
                 if count > u32::from(max) {
+                    let right = if subject.file.count.is_some() {
+                        "`poll: never`, which takes several"
+                    } else {
+                        "a shorter type"
+                    };
                     self.faults.add(
                         &place,
-                        format!("a value of {count} {what}, but one request carries {max} (`{limit}`); expected a shorter type"),
+                        format!("a value of {count} {what}, but one request carries {max} (`{limit}`); expected {right}"),
                     );
                 }
             }
