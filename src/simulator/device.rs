@@ -12,6 +12,7 @@ use crate::simulator::metz_connect::mr_ai8::MrAi8;
 use crate::simulator::metz_connect::mr_ao4::{MrAo4, MrAop4};
 use crate::simulator::metz_connect::mr_ci4::MrCi4;
 use crate::simulator::metz_connect::mr_di::{MrDi4, MrDi10};
+use crate::simulator::metz_connect::mr_dio42::MrDio42;
 use crate::simulator::metz_connect::mr_do4::{MrDo4, MrDoa4};
 use crate::simulator::metz_connect::mr_si4::MrSi4;
 use crate::simulator::metz_connect::mr_to4::MrTo4;
@@ -172,6 +173,7 @@ pub enum Model {
     MrAop4,
     MrCi4,
     MrTo4,
+    MrDio42,
     BtrMrAi8,
     Relay8,
     AnalogOut8,
@@ -179,7 +181,7 @@ pub enum Model {
 }
 
 impl Model {
-    pub const ALL: [Model; 14] = [
+    pub const ALL: [Model; 15] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,
@@ -190,6 +192,7 @@ impl Model {
         Model::MrAop4,
         Model::MrCi4,
         Model::MrTo4,
+        Model::MrDio42,
         Model::BtrMrAi8,
         Model::Relay8,
         Model::AnalogOut8,
@@ -209,6 +212,7 @@ impl Model {
             Model::MrAop4 => "metz-connect/mr-aop4",
             Model::MrCi4 => "metz-connect/mr-ci4",
             Model::MrTo4 => "metz-connect/mr-to4",
+            Model::MrDio42 => "metz-connect/mr-dio42",
             Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
             Model::AnalogOut8 => "fuehlersysteme/analog-out8",
@@ -233,6 +237,7 @@ impl Model {
             Model::MrAop4 => Box::new(MetzConnect::new(now, line, MrAop4::new(now))),
             Model::MrCi4 => Box::new(MetzConnect::new(now, line, MrCi4::new(now))),
             Model::MrTo4 => Box::new(MetzConnect::new(now, line, MrTo4::new(now))),
+            Model::MrDio42 => Box::new(MetzConnect::new(now, line, MrDio42::new(now))),
             Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
             Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),

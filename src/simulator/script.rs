@@ -29,14 +29,16 @@ pub struct Step {
 }
 
 /// The commands, as the help shows them.
-pub const COMMANDS: &str = "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4)
+pub const COMMANDS: &str =
+    "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4, MR-DIO4/2)
   unit N triac T hand on|off|automatic      a triac's hand switch (MR-TO4)
   unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
   unit N input I ohms X | volts X | celsius X | open
                                             what is connected to an input (MR-AI8)
   unit N input I volts X | milliamps X | open
                                             what is connected to an input (MR-CI4, analog-in8)
-  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, analog-in8)
+  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-DIO4/2,
+                                            analog-in8)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
   unit N dip D on|off                       a DIP switch (MR-CI4)

@@ -5,11 +5,13 @@
 
 pub(super) mod analog_inputs;
 pub(super) mod channel;
+mod contacts;
 pub(super) mod holding;
 pub mod mr_ai8;
 pub mod mr_ao4;
 pub mod mr_ci4;
 pub mod mr_di;
+pub mod mr_dio42;
 pub mod mr_do4;
 pub mod mr_si4;
 pub mod mr_to4;
@@ -32,6 +34,8 @@ pub trait Module: Send {
     const FUNCTIONS: &'static [u8];
     /// Those that write register 65.
     const LINE_FUNCTIONS: &'static [u8] = &[6, 16];
+    /// Whether register 65 can be read, too. [`Module::serve`] then has any word there.
+    const READS_LINE: bool = false;
 
     /// Answers a request with one of `FUNCTIONS`, for anything but register 65.
     fn serve(&mut self, now: Time, request: &Request) -> Result<Vec<u8>, Exception>;
@@ -107,8 +111,32 @@ impl<M: Module> MetzConnect<M> {
                 self.set_line(words[0])?;
                 Ok(Some(write_reply(function, LINE_REGISTER, 1)))
             }
-            _ => self.module.serve(now, &request).map(Some),
+            _ => {
+                let mut reply = self.module.serve(now, &request)?;
+                if M::READS_LINE {
+                    self.tell_line(&request, &mut reply);
+                }
+                Ok(Some(reply))
+            }
         }
+    }
+
+    /// Puts register 65 where it stands in the reply to a read. Its high byte is the magic number of
+    /// writes, of which the manual does not say that it can be read: here it is 0.
+    fn tell_line(&self, request: &Request, reply: &mut [u8]) {
+        let Request::Read { function: 3, first, .. } = *request else { return };
+        let Some(before) = LINE_REGISTER.checked_sub(first) else { return };
+        if let Some(word) = reply.get_mut(2 + 2 * usize::from(before)..).and_then(|rest| rest.get_mut(..2)) {
+            word.copy_from_slice(&self.line_code().to_be_bytes());
+        }
+    }
+
+    /// Bit rate and parity as register 65 codes them.
+    fn line_code(&self) -> u16 {
+        let parity = PARITIES.iter().position(|parity| *parity == self.line.parity).map_or(0, |at| at + 1);
+        // A bit rate that register 65 has no code for is the line's own: 0, "not set".
+        let baud = BAUD_RATES.iter().position(|baud| *baud == self.line.baud).map_or(0, |at| at + 1);
+        (parity << 4 | baud) as u16
     }
 
     /// Register 65, "Bitrate einstellen über Modbus-Kommando" (page 3). Codes that are in no table
@@ -241,10 +269,7 @@ impl<M: Module> SimulatedDevice for MetzConnect<M> {
     }
 
     fn eeprom(&self) -> Vec<u16> {
-        let parity = PARITIES.iter().position(|parity| *parity == self.line.parity).map_or(0, |at| at + 1);
-        // A bit rate that register 65 has no code for is the line's own: stored as 0, "not set".
-        let baud = BAUD_RATES.iter().position(|baud| *baud == self.line.baud).map_or(0, |at| at + 1);
-        let mut words = vec![(parity << 4 | baud) as u16];
+        let mut words = vec![self.line_code()];
         words.extend(self.module.eeprom());
         words
     }
@@ -279,6 +304,7 @@ mod tests {
             (Model::MrDi4, metz_connect, "MR-DI4", "V1.4"),
             (Model::MrDi10, metz_connect, "MR-DI10", "V1.4"),
             (Model::MrDoa4, metz_connect, "MR-DO4", "V1.4"),
+            (Model::MrDio42, metz_connect, "MR-DIO4/2", "V2.0"),
             (Model::MrAo4, metz_connect, "MR-AO4", "V1.4"),
             (Model::MrAop4, metz_connect, "MR-AOP4", "V1.5"),
             (Model::MrTo4, metz_connect, "MR-TO4", "V1.5"),

@@ -2,8 +2,8 @@
 //! pages differ in nothing but the number of inputs.
 
 use crate::engine::time::Time;
-use crate::simulator::device::{Signal, Stimulus};
-use crate::simulator::metz_connect::Module;
+use crate::simulator::device::Stimulus;
+use crate::simulator::metz_connect::{Module, contacts};
 use crate::simulator::pdu::{Exception, Request, bits_reply, check_span, words_reply};
 
 /// So many contacts, each closed or open; nothing of them is stored.
@@ -47,16 +47,7 @@ impl<const INPUTS: usize> Module for MrDi<INPUTS> {
         let Stimulus::Input { input, signal } = *stimulus else {
             return Err(format!("{} has inputs and nothing else to touch", Self::PRODUCT));
         };
-        let Some(closed) = usize::from(input).checked_sub(1).and_then(|number| self.closed.get_mut(number))
-        else {
-            return Err(format!("input {input} is not there; {} has 1 to {INPUTS}", Self::PRODUCT));
-        };
-        *closed = match signal {
-            Signal::Contact(closed) => closed,
-            Signal::Open => false,
-            _ => return Err(format!("an input of {} takes a contact", Self::PRODUCT)),
-        };
-        Ok(())
+        contacts::connect(&mut self.closed, input, signal, Self::PRODUCT)
     }
 }
 

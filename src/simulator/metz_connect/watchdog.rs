@@ -1,4 +1,4 @@
-//! The watchdog of register 66, which all METZ CONNECT devices with outputs have (pages 8, 13, 44, 46).
+//! The watchdog of register 66, which all METZ CONNECT devices with outputs have (pages 8, 13, 24, 44, 46).
 
 use crate::engine::time::{Duration, Time};
 
@@ -25,9 +25,19 @@ impl Watchdog {
         self.expired = false;
     }
 
+    /// How long no message has come.
+    pub fn silence(&self, now: Time) -> Duration {
+        now.since(self.last_message)
+    }
+
+    /// Whether it has expired and no message has come since.
+    pub fn is_expired(&self) -> bool {
+        self.expired
+    }
+
     /// True once each time it expires.
     pub fn expires(&mut self, now: Time) -> bool {
-        let is_over = self.time > 0 && now.since(self.last_message) >= UNIT * self.time.into();
+        let is_over = self.time > 0 && self.silence(now) >= UNIT * self.time.into();
         let expires = is_over && !self.expired;
         self.expired |= is_over;
         expires
