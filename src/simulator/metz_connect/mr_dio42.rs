@@ -414,3 +414,6 @@ impl Module for MrDio42 {
         self.reserve_inputs();
     }
 }
+
+#[cfg(test)]
+mod tests;

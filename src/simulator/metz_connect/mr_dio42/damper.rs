@@ -94,10 +94,8 @@ impl Damper {
         if self.alarm == Alarm::Ok {
             self.alarm = self.detect(now, motor, contacts, times);
         }
-        let normal = motor.normal();
-        // "Er endet, wenn die normale Position erreicht ist oder bei einem Fehler" (page 32). Where
-        // ActuDrive wants the safe position meanwhile, its row of the table no longer applies.
-        if self.alarm != Alarm::Ok || position == normal || self.drive != normal {
+        // "Er endet, wenn die normale Position erreicht ist oder bei einem Fehler" (page 32).
+        if self.alarm != Alarm::Ok || position == motor.normal() {
             self.resetting = false;
         }
         let relay = self.relay(motor, is_in_fire_position(motor, contacts), relay);
@@ -164,3 +162,6 @@ fn alarm_without_motor(mode: Mode, contacts: [bool; 2]) -> Alarm {
         _ => Alarm::Ok,
     }
 }
+
+#[cfg(test)]
+mod tests;
