@@ -205,9 +205,8 @@ impl MrDio42 {
             6 | 7 => channel.settings.turn_off_time = word,
             8 | 9 => {
                 channel.settings.heartbeat = word;
-                if word != 0 {
-                    channel.damper.feed(now);
-                }
+                // Setting it to 0 does not start it; but then nothing counts.
+                channel.damper.feed(now);
             }
             10 | 11 => {
                 if let (Some(motor), Some(drive)) = (motor, Position::from_drive(word)) {

@@ -1,5 +1,6 @@
 //! Registers, and the modes that have no alarm codes: Direct_Control, Fire_Damper, Input_Logic_Control.
 
+use super::*;
 use crate::simulator::device::{Addressed, Model};
 use crate::simulator::testing::Bench;
 
@@ -220,6 +221,13 @@ fn toggle_bits_turn_over_at_each_rise_and_at_each_fall_page_22() {
     connect(&mut bench, "..1.");
     bench.act("restart").expect("a restart");
     bench.check(&[("04 0000 0003", "04 06 0004 0000 0000")]);
+    // Neither has what a mode that looks every 100 ms has not seen before.
+    write(&mut bench, 2, 6);
+    bench.wait(10);
+    connect(&mut bench, "1");
+    bench.check(&[("04 0000 0003", "04 06 0004 0000 0000")]);
+    bench.act("restart").expect("a restart");
+    bench.check(&[("04 0000 0003", "04 06 0005 0000 0000")]);
 }
 
 #[test]
@@ -243,8 +251,12 @@ fn a_watchdog_that_no_message_feeds_sets_the_defaults_in_direct_control_alone_pa
         write(&mut bench, 3, mode);
         bench.act("restart").expect("a restart");
         write(&mut bench, 1, 1);
-        bench.wait(1000);
-        assert_eq!((bench.output("relay_1"), bench.output("relay_2")), ("ON".into(), "ON".into()), "{mode}");
+        for millis in [1000, 100] {
+            bench.wait(millis);
+            let relays = (bench.output("relay_1"), bench.output("relay_2"));
+            assert_eq!(relays, ("ON".into(), "ON".into()), "{mode}");
+            assert_eq!(bench.output("red_led"), "ON");
+        }
         write(&mut bench, 1, 2);
     }
 }
@@ -312,6 +324,16 @@ fn a_relay_toggles_each_time_that_an_assigned_input_closes_pages_23_and_35() {
     // A closed contact has not just been closed when the device starts: the default holds (page 34).
     bench.act("restart").expect("a restart");
     bench.check(&[("01 0000 0010", "01 02 2200")]);
+}
+
+#[test]
+fn each_of_several_inputs_that_close_at_once_toggles_page_35() {
+    for (closing, toggles) in [(0b0001, true), (0b0011, false), (0b0111, true), (0b1000, false)] {
+        let mut channel = Channel::new(Time(0));
+        channel.settings = Settings { mode: Mode::InputLogicControl, logic: 0b0111, ..FACTORY };
+        channel.decide(closing, closing);
+        assert_eq!(channel.wanted, toggles, "{closing:04b}");
+    }
 }
 
 #[test]
