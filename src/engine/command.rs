@@ -130,7 +130,7 @@ impl CommandFlow {
         };
         let flow = |state| CommandFlow { point, wanted: wanted.to_string(), state };
         let reads_before = details.persistent || write.at.bits.is_some() || write.on_change.is_some();
-        if is_press(write) || !reads_before {
+        if !reads_before {
             let call = write_call(write, &field);
             return (Some(flow(State::Writing { field })), Step::Ask(call));
         }

@@ -13,7 +13,9 @@ type State = (&'static str, &'static str, &'static [(&'static str, i128)]);
 /// The states beside the one that a device leaves the factory with.
 const STATES: &[State] = &[
     ("btr/mr-ai8", "pt1000 as integer", &[("code", 0x85)]),
+    ("fuehlersysteme/analog-in8", "contacts", &[("function", 1)]),
     ("fuehlersysteme/analog-out8", "current outputs", &[("signal", 1)]),
+    ("fuehlersysteme/sensor", "extremes and relay of the temperature", &[("of", 2)]),
     ("metz-connect/mr-ai8", "pt1000 as float, °C", &[("code", 0x84)]),
     ("metz-connect/mr-ai8", "pt1000 as integer, °F", &[("code", 0x85), ("temperature_unit", 1)]),
     ("metz-connect/mr-ai8", "resistance in steps of 100 ohms", &[("code", 0x44)]),

@@ -45,6 +45,9 @@ pub fn without_a_reading(device: &Device, file: &str) -> Vec<String> {
     for point in device.points.iter().filter(|point| point.is_read()) {
         wanted.insert(point.name.clone());
         match &point.encoding {
+            // The forms of other points, each of which has a reading of its own.
+            Encoding::Cases { by, .. } if device.points[*by].refers.is_some() => {}
+            Encoding::Plain(_) if point.refers.is_some() => {}
             Encoding::Cases { cases, .. } => {
                 let with_form = cases.iter().filter(|case| case.form.is_some());
                 wanted.extend(with_form.map(|case| case_called(&case.name)));
