@@ -1,10 +1,9 @@
 //! The analog board with eight inputs (chapter 6.3 of the manual).
 
-use std::collections::VecDeque;
-
-use crate::engine::time::{Duration, Time};
+use crate::engine::time::Time;
 use crate::simulator::device::{Signal, Stimulus, take_words};
 use crate::simulator::fuehlersysteme::board::{AUTOMATIC, Board, Table};
+use crate::simulator::fuehlersysteme::damping::Damping;
 use crate::simulator::fuehlersysteme::ranges::{Terminal, number, number_above, number_below};
 
 /// The board.
@@ -16,7 +15,6 @@ pub struct Inputs {
     /// RWreg_01 to 08: hundredths of a volt or a milliampere, or 11111.
     fixed: [u16; INPUTS],
     inputs: [Input; INPUTS],
-    measured_at: Time,
 }
 
 /// What is marked with a star, and so "auch gespeichert".
@@ -38,8 +36,8 @@ struct Settings {
 #[derive(Clone, Debug)]
 struct Input {
     signal: Signal,
-    /// The last measurements in hundredths, the newest at the back.
-    measurements: VecDeque<f64>,
+    /// In hundredths.
+    measured: Damping,
     /// "bei < 1 V als (LOW) und bei > 2,5 V als (HIGH) erkannt"; in between it stays what it was.
     is_high: bool,
     /// Was on under RWreg_49 and has not been told since; under RWreg_50 and has not been reset.
@@ -52,9 +50,6 @@ const INPUTS: usize = 8;
 const CURRENT_INPUTS: u8 = 0x80;
 const FIXED_MAX: u16 = 2000;
 const DAMPING_MAX: u16 = 60;
-/// The manual calls the damping a mean and names neither of how many measurements nor how often: here
-/// of as many as the register says, as it is with RWreg_27 of the sensors, ten of them a second.
-const MEASURED_EVERY: Duration = Duration::from_millis(100);
 const LOW_BELOW: f64 = 100.0;
 const HIGH_ABOVE: f64 = 250.0;
 /// What the DIP switch lets an open contact give; the manual says only "high".
@@ -99,9 +94,7 @@ impl Inputs {
         if self.fixed[input] != AUTOMATIC {
             return terminal.limit(self.fixed[input].into());
         }
-        let damping = usize::from(self.settings.damping[input].max(1));
-        let newest = || self.inputs[input].measurements.iter().rev().take(damping);
-        terminal.limit(newest().sum::<f64>() / newest().count().max(1) as f64)
+        terminal.limit(self.inputs[input].measured.mean(self.settings.damping[input]))
     }
 
     /// Rreg_11 to 18: the value within its span; of a digital input, which has none, 0 or 1 as well.
@@ -133,18 +126,6 @@ impl Inputs {
         }
     }
 
-    /// Measures so many times what has been there since the last measurement.
-    fn measure(&mut self, times: u128) {
-        let times = times.min(DAMPING_MAX.into()) as usize;
-        for number in 0..INPUTS {
-            let amount = self.at_terminal(number);
-            let measurements = &mut self.inputs[number].measurements;
-            measurements.extend(std::iter::repeat_n(amount, times));
-            let surplus = measurements.len().saturating_sub(DAMPING_MAX.into());
-            measurements.drain(..surplus);
-        }
-    }
-
     /// RWreg_51 to 59.
     fn reset(&mut self, bits: u8) {
         for input in (0..INPUTS).filter(|input| bits >> input & 1 == 1) {
@@ -160,7 +141,7 @@ impl Table for Inputs {
     fn new(now: Time) -> Inputs {
         let input = Input {
             signal: Signal::Open,
-            measurements: VecDeque::new(),
+            measured: Damping::new(now, DAMPING_MAX),
             is_high: false,
             held_until_told: false,
             held_until_reset: false,
@@ -169,7 +150,6 @@ impl Table for Inputs {
             settings: FACTORY,
             fixed: [AUTOMATIC; INPUTS],
             inputs: std::array::from_fn(|_| input.clone()),
-            measured_at: now,
         }
     }
 
@@ -247,9 +227,10 @@ impl Table for Inputs {
     }
 
     fn advance(&mut self, now: Time) {
-        let times = now.since(self.measured_at).as_millis() / MEASURED_EVERY.as_millis();
-        self.measured_at += Duration::from_millis((times * MEASURED_EVERY.as_millis()) as u64);
-        self.measure(times);
+        for number in 0..INPUTS {
+            let amount = self.at_terminal(number);
+            self.inputs[number].measured.advance(now, amount);
+        }
         self.look();
     }
 

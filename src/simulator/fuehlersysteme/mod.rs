@@ -3,6 +3,7 @@
 pub mod analog_in8;
 pub mod analog_out8;
 mod board;
+mod damping;
 mod ranges;
 mod relay;
 pub mod relay8;
