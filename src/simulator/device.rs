@@ -7,6 +7,7 @@ use crate::simulator::btr;
 use crate::simulator::fuehlersysteme::analog_in8::AnalogIn8;
 use crate::simulator::fuehlersysteme::analog_out8::AnalogOut8;
 use crate::simulator::fuehlersysteme::relay8::Relay8;
+use crate::simulator::fuehlersysteme::sensor::Sensor;
 use crate::simulator::metz_connect::MetzConnect;
 use crate::simulator::metz_connect::mr_ai8::MrAi8;
 use crate::simulator::metz_connect::mr_ao4::{MrAo4, MrAop4};
@@ -49,6 +50,12 @@ pub trait SimulatedDevice: Send {
         None
     }
 
+    /// The function and register that say what this device is, and a bit of it by which it differs from
+    /// another device. `None`: it says so by names, or not at all.
+    fn identity_register(&self) -> Option<(u8, u16, u16)> {
+        None
+    }
+
     /// A device that cannot answer within this time does not answer at all.
     fn gives_up_after(&self) -> Option<Duration> {
         None
@@ -86,6 +93,90 @@ pub enum Stimulus {
     Dip { switch: u8, on: bool },
     /// Somebody presses the button at the device's front.
     Button,
+    /// What a sensor has around it, in the quantity's unit; of a contact 1 is open and 0 closed.
+    Measure { quantity: Quantity, value: f64 },
+    /// Somebody moves in front of a detector.
+    Motion,
+}
+
+/// What a sensor may measure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Quantity {
+    /// % relative humidity.
+    Humidity,
+    /// °C.
+    Temperature,
+    /// ppm.
+    Co2,
+    /// %.
+    Voc,
+    /// ppm.
+    Co,
+    Volts,
+    Milliamps,
+    /// % of the volume.
+    Oxygen,
+    /// mbar.
+    AirPressure,
+    /// The difference of two pressures in Pa.
+    Pressure,
+    /// lx.
+    Light,
+    /// m/s.
+    Flow,
+    Door,
+    Window,
+    Switch,
+}
+
+impl Quantity {
+    pub const ALL: [Quantity; 15] = [
+        Quantity::Humidity,
+        Quantity::Temperature,
+        Quantity::Co2,
+        Quantity::Voc,
+        Quantity::Co,
+        Quantity::Volts,
+        Quantity::Milliamps,
+        Quantity::Oxygen,
+        Quantity::AirPressure,
+        Quantity::Pressure,
+        Quantity::Light,
+        Quantity::Flow,
+        Quantity::Door,
+        Quantity::Window,
+        Quantity::Switch,
+    ];
+
+    /// Its word in scripts.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Quantity::Humidity => "humidity",
+            Quantity::Temperature => "temperature",
+            Quantity::Co2 => "co2",
+            Quantity::Voc => "voc",
+            Quantity::Co => "co",
+            Quantity::Volts => "volts",
+            Quantity::Milliamps => "milliamps",
+            Quantity::Oxygen => "oxygen",
+            Quantity::AirPressure => "air_pressure",
+            Quantity::Pressure => "pressure",
+            Quantity::Light => "light",
+            Quantity::Flow => "flow",
+            Quantity::Door => "door",
+            Quantity::Window => "window",
+            Quantity::Switch => "switch",
+        }
+    }
+
+    pub fn from_name(name: &str) -> Option<Quantity> {
+        Quantity::ALL.into_iter().find(|quantity| quantity.name() == name)
+    }
+
+    /// Whether it is `open` or `closed` and no number.
+    pub const fn is_contact(self) -> bool {
+        matches!(self, Quantity::Door | Quantity::Window | Quantity::Switch)
+    }
 }
 
 /// The position of a hand switch.
@@ -178,6 +269,7 @@ pub enum Model {
     Relay8,
     AnalogOut8,
     AnalogIn8,
+    Sensor,
 }
 
 impl Model {
@@ -197,6 +289,7 @@ impl Model {
         Model::Relay8,
         Model::AnalogOut8,
         Model::AnalogIn8,
+        Model::Sensor,
     ];
 
     /// The identifier of the device's profile.
@@ -217,6 +310,7 @@ impl Model {
             Model::Relay8 => "fuehlersysteme/relay8",
             Model::AnalogOut8 => "fuehlersysteme/analog-out8",
             Model::AnalogIn8 => "fuehlersysteme/analog-in8",
+            Model::Sensor => "fuehlersysteme/sensor",
         }
     }
 
@@ -242,6 +336,7 @@ impl Model {
             Model::Relay8 => Box::new(Relay8::new(now)),
             Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),
             Model::AnalogIn8 => Box::new(AnalogIn8::new(now)),
+            Model::Sensor => Box::new(Sensor::new(now)),
         }
     }
 }
@@ -339,6 +434,9 @@ mod tests {
         ];
         prop_oneof![
             Just(Stimulus::Button),
+            Just(Stimulus::Motion),
+            (proptest::sample::select(&Quantity::ALL[..]), -1e9..1e9f64)
+                .prop_map(|(quantity, value)| Stimulus::Measure { quantity, value }),
             (0..6u8).prop_map(|relay| Stimulus::Hand { relay, position: Hand::On }),
             (0..6u8, 0.0..12.0f64)
                 .prop_map(|(output, volts)| Stimulus::HandVolts { output, volts: Some(volts) }),

@@ -263,7 +263,7 @@ impl Unit {
             return Vec::new();
         }
         if kinds.contains(&FaultKind::WrongIdentity) {
-            falsify_identity(request, &mut pdu);
+            falsify_identity(request, self.device.identity_register(), &mut pdu);
         }
         self.transmit(now + turnaround + pace.request_time, framing, request, pdu, &kinds, pace.per_byte)
     }
@@ -328,21 +328,28 @@ impl Unit {
     }
 }
 
-/// Says that the device is another one: the last letter of its product name, or the system code in
-/// the first input register of a FuehlerSysteme device.
-fn falsify_identity(request: &Frame, pdu: &mut [u8]) {
-    match request.pdu[..] {
-        [43, 14, ..] if pdu[0] == 43 => {
-            // Seven bytes, then object 0 with its length, then object 1 with its length.
-            let vendor_length = usize::from(pdu.get(8).copied().unwrap_or(0));
-            let product = 9 + vendor_length;
-            let product_length = usize::from(pdu.get(product + 1).copied().unwrap_or(0));
-            if let Some(letter) = pdu.get_mut(product + 1 + product_length) {
-                *letter = b'X';
-            }
+/// Says that the device is another one: in the last letter of its product name, or in the register that
+/// says what it is.
+fn falsify_identity(request: &Frame, register: Option<(u8, u16, u16)>, pdu: &mut [u8]) {
+    if let ([43, 14, ..], Some(43)) = (&request.pdu[..], pdu.first()) {
+        // Seven bytes, then object 0 with its length, then object 1 with its length.
+        let vendor_length = usize::from(pdu.get(8).copied().unwrap_or(0));
+        let product = 9 + vendor_length;
+        let product_length = usize::from(pdu.get(product + 1).copied().unwrap_or(0));
+        if let Some(letter) = pdu.get_mut(product + 1 + product_length) {
+            *letter = b'X';
         }
-        [4, 0, 0, ..] if pdu[0] == 4 && pdu.len() >= 4 && pdu[2] == 0x50 => pdu[2] = 0x40,
-        _ => {}
+    }
+    let (Some((function, register, bit)), [asked, high, low, ..]) = (register, &request.pdu[..]) else {
+        return;
+    };
+    let at = usize::from(register.wrapping_sub(u16::from_be_bytes([*high, *low]))) * 2 + 2;
+    if *asked == function && pdu.first() == Some(&function) {
+        if let Some(word) = pdu.get_mut(at..at + 2) {
+            let [high, low] = bit.to_be_bytes();
+            word[0] ^= high;
+            word[1] ^= low;
+        }
     }
 }
 

@@ -8,7 +8,7 @@
 //! ```
 
 use crate::engine::time::Duration;
-use crate::simulator::device::{Hand, Signal, Stimulus};
+use crate::simulator::device::{Hand, Quantity, Signal, Stimulus};
 use crate::simulator::fault::Fault;
 
 /// What a line of a script does.
@@ -43,6 +43,10 @@ pub const COMMANDS: &str =
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
   unit N dip D on|off                       a DIP switch (MR-CI4)
   unit N button                             somebody presses the button (MR-SI4)
+  unit N measure QUANTITY X                 what is around a sensor (sensor): humidity, temperature, co2,
+                                            voc, co, volts, milliamps, oxygen, air_pressure, pressure,
+                                            light, flow; door, window, switch with `open` or `closed`
+  unit N motion                             somebody moves (sensor)
   unit N power off|on                       power loss: only the EEPROM is kept
   unit N restart                            the same, and silent for two seconds
   unit N fault KIND | none                  see --fault
@@ -97,6 +101,8 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
             return Ok(Action::Fault(Fault { unit: Some(unit), ..fault }));
         }
         ["button"] => Stimulus::Button,
+        ["motion"] => Stimulus::Motion,
+        ["measure", quantity, value] => parse_measure(quantity, value)?,
         ["relay" | "triac", relay, "hand", position] => {
             let position = match *position {
                 "automatic" => Hand::Automatic,
@@ -123,6 +129,19 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
         _ => return Err(format!("`{}` is not a command; there are\n{COMMANDS}", command.join(" "))),
     };
     Ok(Action::Stimulate { unit, stimulus })
+}
+
+fn parse_measure(quantity: &str, value: &str) -> Result<Stimulus, String> {
+    let known = || Quantity::ALL.map(|quantity| format!("`{}`", quantity.name())).join(", ");
+    let quantity = Quantity::from_name(quantity)
+        .ok_or_else(|| format!("`{quantity}` is not measured; there are {}", known()))?;
+    let value = match value {
+        _ if !quantity.is_contact() => parse_finite(value)?,
+        "open" => 1.0,
+        "closed" => 0.0,
+        _ => return Err(format!("`{value}` is neither `open` nor `closed`")),
+    };
+    Ok(Stimulus::Measure { quantity, value })
 }
 
 fn parse_signal(words: &[&str]) -> Result<Signal, String> {
@@ -211,6 +230,17 @@ mod tests {
                 0,
                 stimulate(21, Stimulus::HandVolts { output: 2, volts: None }),
             ),
+            (
+                "unit 5 measure co2 812.5",
+                0,
+                stimulate(5, Stimulus::Measure { quantity: Quantity::Co2, value: 812.5 }),
+            ),
+            (
+                "unit 5 measure door open",
+                0,
+                stimulate(5, Stimulus::Measure { quantity: Quantity::Door, value: 1.0 }),
+            ),
+            ("unit 5 motion", 0, stimulate(5, Stimulus::Motion)),
             ("unit 18 restart", 0, Action::Restart { unit: 18 }),
             (
                 "unit 18 fault late=700ms,every=2",
@@ -235,6 +265,18 @@ mod tests {
         for ((line, error), (wanted_line, beginning)) in told.iter().zip(wanted) {
             assert!(*line == wanted_line && error.starts_with(beginning), "{line}: {error}");
         }
+    }
+
+    #[test]
+    fn every_quantity_is_in_the_help_and_takes_a_number_or_open_and_closed() {
+        for quantity in Quantity::ALL {
+            assert!(COMMANDS.contains(quantity.name()), "{quantity:?}");
+            let parse = |value: &str| parse_line(&format!("unit 5 measure {} {value}", quantity.name()));
+            assert_eq!(parse("closed").is_ok(), quantity.is_contact(), "{quantity:?}");
+            assert_eq!(parse("1").is_ok(), !quantity.is_contact(), "{quantity:?}");
+        }
+        let error = parse_line("unit 5 measure colour 1").unwrap_err();
+        assert!(error.starts_with("`colour` is not measured; there are `humidity`, "), "{error}");
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! What the I/O boards of FuehlerSysteme have in common: the requests (chapters 8 and 9), and the
-//! registers that every table of chapter 6 has, with chapter 7 behind them.
+//! What the devices of FuehlerSysteme have in common: the requests (chapters 8 and 9), and the
+//! registers that every table of chapters 3 and 6 has, with chapter 7 behind them.
 //!
 //! Not simulated: the operation as a master (address 255), which is no device on somebody's line.
 
@@ -7,10 +7,15 @@ use crate::engine::time::{Duration, Time};
 use crate::simulator::device::{Addressed, SimulatedDevice, Stimulus, check_eeprom_length, take_words};
 use crate::simulator::pdu::{Exception, Request, exception_reply, words_reply, write_reply};
 
-/// One board's own tables: its registers from 1 to 78, its process side, what it stores.
+/// One board's own tables: its registers between the common ones, its process side, what it stores.
 pub trait Table: Send {
     /// Whether RWreg_90 to 99 are in its table.
     const HAS_SCRATCH: bool;
+    /// How many registers there are from RWreg_200, from Rreg_100 and from Wreg_500 on: the boards of
+    /// chapter 6 have them to RWreg_327, Rreg_227 and Wreg_627. An even number.
+    const SPECIALS: u16 = 128;
+    /// Whether RWreg_79 takes numbers that mean nothing: the range is "10, 20" in chapter 6.
+    const RESTART_TAKES_ALL: bool = false;
 
     /// A board fresh from the factory.
     fn new(now: Time) -> Self;
@@ -45,16 +50,18 @@ pub struct Board<T> {
     /// RWreg_00. Stored.
     customer_code: u16,
     /// RWreg_200 to 327. Stored. One table says "0 bis 327", chapter 7 "RWreg_200 ... (Aktor: ..._327)".
-    master: [u16; SPECIALS],
+    master: Vec<u16>,
     /// RWreg_90 to 99.
     scratch: [u16; 10],
     /// Rreg_100 to 227, written through Wreg_500 to 627.
-    special: [u16; SPECIALS],
+    special: Vec<u16>,
 }
 
 /// The word that gives a fixed value back to the board itself.
 pub const AUTOMATIC: u16 = 11111;
-const SPECIALS: usize = 128;
+const MASTER: u16 = 200;
+const SPECIAL: u16 = 100;
+const SPECIAL_WRITTEN: u16 = 500;
 /// Rreg_79, told as day, month and year run together: the manual's own example.
 const SOFTWARE: u16 = 1018;
 const CUSTOMER_CODE: u16 = 0x5300;
@@ -87,9 +94,9 @@ impl<T: Table> Board<T> {
         Board {
             table: T::new(now),
             customer_code: CUSTOMER_CODE,
-            master: [0; SPECIALS],
+            master: vec![0; T::SPECIALS.into()],
             scratch: [0; 10],
-            special: [0; SPECIALS],
+            special: vec![0; T::SPECIALS.into()],
         }
     }
 
@@ -152,8 +159,10 @@ impl<T: Table> Board<T> {
         match register {
             0 => Some(self.table.system_code()),
             79 => Some(SOFTWARE),
-            100..=227 => Some(self.special[usize::from(register - 100)]),
-            _ => self.table.read_input(now, register),
+            _ => match special::<T>(SPECIAL, register) {
+                Some(at) => Some(self.special[at]),
+                None => self.table.read_input(now, register),
+            },
         }
     }
 
@@ -164,15 +173,19 @@ impl<T: Table> Board<T> {
             // Both kinds of restart are over before anybody can ask.
             79 => Some(0),
             90..=99 if T::HAS_SCRATCH => Some(self.scratch[usize::from(register - 90)]),
-            200..=327 => Some(self.master[usize::from(register - 200)]),
-            _ => self.table.read_holding(register),
+            _ => match special::<T>(MASTER, register) {
+                Some(at) => Some(self.master[at]),
+                None => self.table.read_holding(register),
+            },
         }
     }
 
     /// Writes all registers, limited to their ranges; none of them where one is not there.
     fn write(&mut self, now: Time, first: u16, words: &[u16]) -> Result<Written, Exception> {
         let last = usize::from(first) + words.len() - 1;
-        let is_there = |register: u16| self.read_holding(register).is_some() || is_write_only(register);
+        let is_there = |register: u16| {
+            self.read_holding(register).is_some() || special::<T>(SPECIAL_WRITTEN, register).is_some()
+        };
         if last > 0xFFFF || !(first..=last as u16).all(is_there) {
             return Err(Exception::Address);
         }
@@ -199,8 +212,8 @@ impl<T: Table> Board<T> {
                 }
             }
             90..=99 => self.scratch[usize::from(register - 90)] = used,
-            200..=327 => self.master[usize::from(register - 200)] = used,
-            500.. => self.special[usize::from(register - 500)] = used,
+            SPECIAL_WRITTEN.. => self.special[usize::from(register - SPECIAL_WRITTEN)] = used,
+            MASTER.. => self.master[usize::from(register - MASTER)] = used,
             _ => self.table.write(now, register, used),
         }
         Written { limited: used != word, restart }
@@ -214,8 +227,8 @@ impl<T: Table> Board<T> {
             // checked, begins at 0.
             0 => word.min(CUSTOMER_CODE_MAX),
             // No measuring range to be limited to: another number does nothing.
-            79 if !matches!(word, 0 | 10 | 20) => 0,
-            79.. => word,
+            79 if !matches!(word, 0 | 10 | 20) && !T::RESTART_TAKES_ALL => 0,
+            79 | 90..=99 | MASTER.. => word,
             _ => self.table.limit(register, word),
         }
     }
@@ -223,7 +236,7 @@ impl<T: Table> Board<T> {
     /// Chapter 7, "Sonderfall nur Gerätebezogener Datentransfer": pairs of RWreg_200 to 327 that name
     /// the device itself (255 reads an Rreg, 254 an RWreg) are always carried out.
     fn copy_registers(&mut self, now: Time) {
-        for pair in (0..SPECIALS).step_by(2) {
+        for pair in (0..self.master.len()).step_by(2) {
             let [from, source] = self.master[pair].to_be_bytes().map(u16::from);
             let [to, target] = self.master[pair + 1].to_be_bytes().map(u16::from);
             // "Verwendete Adr. 00 sowie Reg. 00 haben hierbei keine Funktionen." A target of 79
@@ -235,8 +248,12 @@ impl<T: Table> Board<T> {
             let Some(word) = word else { continue };
             self.special[pair] = word;
             self.special[pair + 1] = self.customer_code;
-            if (100..=227).contains(&target) {
-                self.special[usize::from(target - 100)] = word;
+            if let Some(at) = special::<T>(SPECIAL, target) {
+                self.special[at] = word;
+                // "… und auch der Kundencode weitergegeben und in das darauffolgende Register eingetragen".
+                if let Some(next) = self.special.get_mut(at + 1) {
+                    *next = self.customer_code;
+                }
             } else if self.read_holding(target).is_some_and(|there| there != word) {
                 self.write_one(now, target, word);
             }
@@ -244,9 +261,10 @@ impl<T: Table> Board<T> {
     }
 }
 
-/// Wreg_500 to 627.
-fn is_write_only(register: u16) -> bool {
-    (500..500 + SPECIALS as u16).contains(&register)
+/// The place of a register among those of chapter 7 that begin at `first`.
+fn special<T: Table>(first: u16, register: u16) -> Option<usize> {
+    let at = register.checked_sub(first)?;
+    (at < T::SPECIALS).then_some(at.into())
 }
 
 impl<T: Table> SimulatedDevice for Board<T> {
@@ -256,7 +274,7 @@ impl<T: Table> SimulatedDevice for Board<T> {
             Ok((reply, restart)) => {
                 if restart == Some(Restart::Factory) {
                     self.customer_code = CUSTOMER_CODE;
-                    self.master = [0; SPECIALS];
+                    self.master.fill(0);
                     self.table.forget();
                 }
                 if restart.is_some() {
@@ -279,7 +297,7 @@ impl<T: Table> SimulatedDevice for Board<T> {
 
     fn restart(&mut self, now: Time) {
         self.scratch = [0; 10];
-        self.special = [0; SPECIALS];
+        self.special.fill(0);
         self.table.restart(now);
         self.advance(now);
     }
@@ -298,7 +316,7 @@ impl<T: Table> SimulatedDevice for Board<T> {
     fn eeprom(&self) -> Vec<u16> {
         let mut words = vec![self.customer_code];
         words.extend(self.table.eeprom());
-        words.extend(self.master);
+        words.extend(&self.master);
         words
     }
 
@@ -307,9 +325,13 @@ impl<T: Table> SimulatedDevice for Board<T> {
         let words = &mut words;
         [self.customer_code] = take_words(words);
         self.table.load_eeprom(words);
-        self.master = take_words(words);
+        self.master.copy_from_slice(words);
         self.restart(now);
         Ok(())
+    }
+
+    fn identity_register(&self) -> Option<(u8, u16, u16)> {
+        Some((4, 0, 0x1000))
     }
 
     fn gives_up_after(&self) -> Option<Duration> {

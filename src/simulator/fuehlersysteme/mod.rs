@@ -7,3 +7,4 @@ mod damping;
 mod ranges;
 mod relay;
 pub mod relay8;
+pub mod sensor;

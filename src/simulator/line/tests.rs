@@ -189,3 +189,19 @@ fn a_relay_board_says_another_system_code_and_is_silent_when_it_cannot_answer_in
     table.act("unit 7 fault slow=1ms");
     assert_eq!(table.ask(7, &read), []);
 }
+
+#[test]
+fn every_device_says_that_it_is_another_one_where_the_register_is_told_among_others() {
+    let devices = [(Model::AnalogIn8, 7), (Model::Sensor, 8)].map(|(model, unit)| DeviceAt { model, unit });
+    let line = Line::new(Time(0), LineSettings::default(), Duration::ZERO, false, &devices);
+    let mut table =
+        Table { line: line.expect("two units"), now: Time::from_millis(100), framing: Framing::Rtu };
+    for (unit, true_code, false_code) in [(7, [0x40, 0x80], [0x50, 0x80]), (8, [0x10, 0], [0, 0])] {
+        let code = |table: &mut Table| table.ask(unit, &[4, 0, 0, 0, 2])[0].bytes[3..5].to_vec();
+        assert_eq!(code(&mut table), true_code);
+        table.act(&format!("unit {unit} fault wrong-identity"));
+        assert_eq!(code(&mut table), false_code);
+        // Other registers are as they were.
+        assert_eq!(table.ask(unit, &[4, 0, 79, 0, 1])[0].bytes, rtu(unit, &[4, 2, 3, 0xFA]));
+    }
+}
