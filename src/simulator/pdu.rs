@@ -124,6 +124,26 @@ pub fn write_reply(function: u8, address: u16, second: u16) -> Vec<u8> {
     reply
 }
 
+/// The reply to function 43/14 with code 1, the basic identification in one piece: vendor, product, version.
+pub fn identification_reply(interface: u8, data: &[u8], objects: &[&[u8]; 3]) -> Result<Vec<u8>, Exception> {
+    if interface != 14 {
+        return Err(Exception::Function);
+    }
+    let [code, object] = data else { return Err(Exception::Value) };
+    // The conformity level 1, which is told, has nothing else.
+    if *code != 1 {
+        return Err(Exception::Value);
+    }
+    // The specification (6.21): an unknown first object begins at the start again.
+    let first = if usize::from(*object) < objects.len() { usize::from(*object) } else { 0 };
+    let mut reply = vec![43, 14, 1, 1, 0, 0, (objects.len() - first) as u8];
+    for (number, text) in objects.iter().enumerate().skip(first) {
+        reply.extend([number as u8, text.len() as u8]);
+        reply.extend(*text);
+    }
+    Ok(reply)
+}
+
 /// The reply that refuses.
 pub fn exception_reply(function: u8, exception: Exception) -> Vec<u8> {
     vec![function | 0x80, exception as u8]

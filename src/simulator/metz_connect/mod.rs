@@ -23,7 +23,7 @@ use crate::engine::time::Time;
 use crate::simulator::device::{
     Addressed, LineSettings, Overheard, Parity, SimulatedDevice, Stimulus, check_eeprom_length,
 };
-use crate::simulator::pdu::{Exception, Request, exception_reply, write_reply};
+use crate::simulator::pdu::{Exception, Request, exception_reply, identification_reply, write_reply};
 
 /// The chapter of one device: its registers, its process side, its EEPROM.
 pub trait Module: Send {
@@ -100,7 +100,11 @@ impl<M: Module> MetzConnect<M> {
         let request = Request::parse(pdu)?;
         match &request {
             Request::Diagnostics { sub_function, data } => self.diagnose(now, *sub_function, data),
-            Request::Encapsulated { interface, data } => identify::<M>(*interface, data).map(Some),
+            // Each chapter's last page: only "Geräte ID Code lesen: 0x01" is told.
+            Request::Encapsulated { interface, data } => {
+                let objects = [M::VENDOR, M::PRODUCT, M::VERSION].map(str::as_bytes);
+                identification_reply(*interface, data, &objects).map(Some)
+            }
             Request::WriteRegister { address: LINE_REGISTER, word } => {
                 self.set_line(*word)?;
                 Ok(Some(write_reply(function, LINE_REGISTER, *word)))
@@ -192,27 +196,6 @@ impl<M: Module> MetzConnect<M> {
         };
         Ok(Some(write_reply(8, sub_function, count)))
     }
-}
-
-/// Function 43/14 as each chapter's last page gives it: basic identification in one reply.
-fn identify<M: Module>(interface: u8, data: &[u8]) -> Result<Vec<u8>, Exception> {
-    if interface != 14 {
-        return Err(Exception::Function);
-    }
-    let [code, object] = data else { return Err(Exception::Value) };
-    // Only "Geräte ID Code lesen: 0x01" is told, and the conformity level 1 has nothing else.
-    if *code != 1 {
-        return Err(Exception::Value);
-    }
-    let objects = [M::VENDOR, M::PRODUCT, M::VERSION];
-    // The specification (6.21): an unknown first object begins at the start again.
-    let first = if usize::from(*object) < objects.len() { usize::from(*object) } else { 0 };
-    let mut reply = vec![43, 14, 1, 1, 0, 0, (objects.len() - first) as u8];
-    for (number, text) in objects.iter().enumerate().skip(first) {
-        reply.extend([number as u8, text.len() as u8]);
-        reply.extend(text.as_bytes());
-    }
-    Ok(reply)
 }
 
 impl<M: Module> SimulatedDevice for MetzConnect<M> {
