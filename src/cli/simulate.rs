@@ -6,22 +6,31 @@ use std::sync::Arc;
 
 use anyhow::Context;
 
-use super::{Failure, output};
+use super::profiles::add_shared_files_near;
+use super::{Failure, configuration, output};
 use crate::edge::shutdown::Signals;
+use crate::engine::profile::Library;
 use crate::engine::time::Duration;
+use crate::simulator::device::parse_unit;
 use crate::simulator::script::{parse_duration, parse_script};
-use crate::simulator::{DeviceAt, Fault, Framing, LineSettings, Options, Parity, Simulation, Told};
+use crate::simulator::{DeviceAt, Fault, Framing, LineSettings, Options, Parity, Plain, Simulation, Told};
 
 /// Serve simulated devices, as their manuals describe them
 ///
 /// The devices share one line: each answers its own unit. What they measure is changed by commands,
 /// from a script or as lines on standard input; what their outputs do is told on standard output.
+///
+/// A device of `--profile` follows no manual: its registers hold what is written or set, within the
+/// rules of the profile.
 #[derive(Debug, clap::Args)]
 #[command(after_help = help())]
 pub struct Args {
     /// The devices, each with its unit: `metz-connect/mr-do4@18`
-    #[arg(value_name = "PROFILE@UNIT", required = true)]
+    #[arg(value_name = "PROFILE@UNIT", required_unless_present = "profile")]
     devices: Vec<DeviceAt>,
+    /// A device that is nothing but this profile, with its unit: `my-device.yaml@5`
+    #[arg(long, value_name = "FILE@UNIT", value_parser = profile_at)]
+    profile: Vec<(PathBuf, u8)>,
     /// Serve RTU on a pseudo-terminal, with a symbolic link to it here
     #[arg(long, value_name = "LINK", required_unless_present_any = ["tcp", "rtu_over_tcp"])]
     pty: Vec<PathBuf>,
@@ -65,8 +74,18 @@ fn help() -> String {
          busker simulate metz-connect/mr-do4@18 metz-connect/mr-ai8@19 --pty /tmp/line --tcp 127.0.0.1:1502\n  \
          and then, on its standard input:\n  \
          unit 18 relay 2 hand on\n  \
-         at 5s unit 19 input 1 ohms 107.8"
+         at 5s unit 19 input 1 ohms 107.8\n\n\
+         A profile of one's own beside them, and a reading of it:\n  \
+         busker simulate metz-connect/mr-do4@18 --profile my-device.yaml@19 --pty /tmp/line\n  \
+         unit 19 set 'input 0' 215"
     )
+}
+
+fn profile_at(text: &str) -> Result<(PathBuf, u8), String> {
+    let (file, unit) = text
+        .rsplit_once('@')
+        .ok_or_else(|| format!("`{text}` names no unit; write it as `my-device.yaml@5`"))?;
+    Ok((file.into(), parse_unit(unit)?))
 }
 
 fn parity(name: &str) -> Result<Parity, String> {
@@ -86,6 +105,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
         }
         None => Vec::new(),
     };
+    let profiles = args.profile.iter().map(load).collect::<Result<Vec<_>, Failure>>()?;
     let options = Options {
         line: LineSettings { baud: args.baud, parity: args.parity },
         turnaround: args.turnaround,
@@ -96,7 +116,8 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     // Before the first door is open: whoever has read its address may end this at once.
     let mut signals = runtime.block_on(async { Signals::listen() })?;
-    let simulation = Simulation::new(&args.devices, options).map_err(Failure::wrong_input)?;
+    let simulation =
+        Simulation::with_profiles(&args.devices, profiles, options).map_err(Failure::wrong_input)?;
     simulation.listen(tell);
     let mut doors: Vec<Box<dyn std::any::Any>> = Vec::new();
     for link in args.pty {
@@ -116,6 +137,18 @@ pub fn run(args: Args) -> Result<(), Failure> {
     obey_standard_input(&simulation)?;
     runtime.block_on(signals.wait());
     Ok(())
+}
+
+/// The device of a profile's file, as `busker profiles check` reads it.
+fn load((file, unit): &(PathBuf, u8)) -> Result<(Plain, u8), Failure> {
+    let shown = file.display().to_string();
+    let bytes = std::fs::read(file)
+        .with_context(|| format!("cannot read the profile `{shown}`"))
+        .map_err(Failure::WrongInput)?;
+    let mut library = Library::shipped();
+    add_shared_files_near(&mut library, file)?;
+    let device = library.check(&shown, &bytes).map_err(configuration::faults)?;
+    Ok((Plain::new(device), *unit))
 }
 
 fn tell(told: &Told) {

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use crate::engine::address::Span;
 use crate::engine::time::{Duration, Time};
 use crate::simulator::btr;
 use crate::simulator::fuehlersysteme::analog_in8::AnalogIn8;
@@ -97,6 +98,8 @@ pub enum Stimulus {
     Measure { quantity: Quantity, value: f64 },
     /// Somebody moves in front of a detector.
     Motion,
+    /// Raw words in registers, or 0 and 1 in bits, of a device that is nothing but its registers.
+    Set { span: Span, words: Vec<u16> },
 }
 
 /// What a sensor may measure.
@@ -365,16 +368,42 @@ impl std::str::FromStr for DeviceAt {
         let known = || Model::ALL.map(|model| format!("`{model}`")).join(", ");
         let model =
             Model::from_id(id).ok_or_else(|| format!("`{id}` is not simulated; there are {}", known()))?;
-        match unit.parse() {
-            Ok(unit @ 1..=247) => Ok(DeviceAt { model, unit }),
-            _ => Err(format!("`{unit}` is not a unit; a unit is 1 to 247")),
-        }
+        Ok(DeviceAt { model, unit: parse_unit(unit)? })
+    }
+}
+
+/// Reads `18`.
+pub fn parse_unit(text: &str) -> Result<u8, String> {
+    match text.parse() {
+        Ok(unit @ 1..=247) => Ok(unit),
+        _ => Err(format!("`{text}` is not a unit; a unit is 1 to 247")),
     }
 }
 
 impl fmt::Display for DeviceAt {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}@{}", self.model, self.unit)
+    }
+}
+
+/// Which device answers at a unit, as a person calls it: `metz-connect/mr-do4@18`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Place {
+    /// The identifier of the device's profile.
+    pub device: String,
+    /// 1 to 247.
+    pub unit: u8,
+}
+
+impl From<DeviceAt> for Place {
+    fn from(at: DeviceAt) -> Place {
+        Place { device: at.model.id().into(), unit: at.unit }
+    }
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}@{}", self.device, self.unit)
     }
 }
 

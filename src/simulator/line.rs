@@ -1,7 +1,9 @@
 //! Several devices on one line: each answers its own unit only, and each may have faults.
 
 use crate::engine::time::{Duration, Time};
-use crate::simulator::device::{Addressed, DeviceAt, LineSettings, Overheard, SimulatedDevice, Stimulus};
+use crate::simulator::device::{
+    Addressed, DeviceAt, LineSettings, Overheard, Place, SimulatedDevice, Stimulus,
+};
 use crate::simulator::fault::{Fault, FaultKind};
 use crate::simulator::script::Action;
 use crate::simulator::wire::{Frame, Framing, Received, character_time};
@@ -17,7 +19,7 @@ pub struct Line {
 
 /// One device with its address, its power and its faults.
 pub struct Unit {
-    pub at: DeviceAt,
+    pub at: Place,
     pub device: Box<dyn SimulatedDevice>,
     powered: bool,
     silent_until: Time,
@@ -61,28 +63,37 @@ impl Line {
         paced: bool,
         devices: &[DeviceAt],
     ) -> Result<Line, String> {
-        let mut units: Vec<Unit> = Vec::new();
+        let mut line = Line { settings, turnaround, paced, units: Vec::new() };
         for at in devices {
-            if let Some(other) = units.iter().find(|unit| unit.at.unit == at.unit) {
-                return Err(format!("`{}` and `{at}` have the same unit; give each its own", other.at));
-            }
-            let device = at.model.build(now, settings);
-            units.push(Unit {
-                at: *at,
-                outputs_told: device.outputs(),
-                device,
-                powered: true,
-                silent_until: Time(0),
-                reboot_at: None,
-                faults: Vec::new(),
-                requests: 0,
-            });
+            line.add((*at).into(), at.model.build(now, settings))?;
         }
-        Ok(Line { settings, turnaround, paced, units })
+        Ok(line)
+    }
+
+    /// Puts one more device on the line. An error says that its unit is there already.
+    pub fn add(&mut self, at: Place, device: Box<dyn SimulatedDevice>) -> Result<(), String> {
+        if let Some(other) = self.units.iter().find(|unit| unit.at.unit == at.unit) {
+            return Err(format!("`{}` and `{at}` have the same unit; give each its own", other.at));
+        }
+        self.units.push(Unit {
+            at,
+            outputs_told: device.outputs(),
+            device,
+            powered: true,
+            silent_until: Time(0),
+            reboot_at: None,
+            faults: Vec::new(),
+            requests: 0,
+        });
+        Ok(())
     }
 
     pub fn units(&self) -> &[Unit] {
         &self.units
+    }
+
+    pub fn units_mut(&mut self) -> &mut [Unit] {
+        &mut self.units
     }
 
     pub fn settings(&self) -> LineSettings {
@@ -164,13 +175,13 @@ impl Line {
     }
 
     /// What has changed at the devices' outputs since the last call: unit, name, state.
-    pub fn changed_outputs(&mut self) -> Vec<(DeviceAt, String, String)> {
+    pub fn changed_outputs(&mut self) -> Vec<(Place, String, String)> {
         let mut changed = Vec::new();
         for unit in &mut self.units {
             let outputs = unit.device.outputs();
             for (now, before) in outputs.iter().zip(&unit.outputs_told) {
                 if now != before {
-                    changed.push((unit.at, now.0.clone(), now.1.clone()));
+                    changed.push((unit.at.clone(), now.0.clone(), now.1.clone()));
                 }
             }
             unit.outputs_told = outputs;

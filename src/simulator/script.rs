@@ -7,8 +7,9 @@
 //! at 6s unit 20 input 1 pulses 100 every 80ms
 //! ```
 
+use crate::engine::address::{Span, Table};
 use crate::engine::time::Duration;
-use crate::simulator::device::{Hand, Quantity, Signal, Stimulus};
+use crate::simulator::device::{Hand, Quantity, Signal, Stimulus, parse_unit};
 use crate::simulator::fault::Fault;
 
 /// What a line of a script does.
@@ -47,6 +48,7 @@ pub const COMMANDS: &str =
                                             voc, co, volts, milliamps, oxygen, air_pressure, pressure,
                                             light, flow; door, window, switch with `open` or `closed`
   unit N motion                             somebody moves (sensor)
+  unit N set 'TABLE ADDRESS' WORD …         raw words from there on, as in `set 'input 0' 215` (--profile)
   unit N power off|on                       power loss: only the EEPROM is kept
   unit N restart                            the same, and silent for two seconds
   unit N fault KIND | none                  see --fault
@@ -83,11 +85,7 @@ pub fn parse_line(line: &str) -> Result<Option<Step>, String> {
     let ["unit", unit, command @ ..] = &words[..] else {
         return Err(format!("`{line}` is not a command; one begins with `unit 18` or `at 5s unit 18`"));
     };
-    let unit = match unit.parse() {
-        Ok(unit @ 1..=247) => unit,
-        _ => return Err(format!("`{unit}` is not a unit; a unit is 1 to 247")),
-    };
-    Ok(Some(Step { after, action: parse_action(unit, command)? }))
+    Ok(Some(Step { after, action: parse_action(parse_unit(unit)?, command)? }))
 }
 
 fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
@@ -102,6 +100,7 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
         }
         ["button"] => Stimulus::Button,
         ["motion"] => Stimulus::Motion,
+        ["set", table, address, words @ ..] if !words.is_empty() => parse_set(table, address, words)?,
         ["measure", quantity, value] => parse_measure(quantity, value)?,
         ["relay" | "triac", relay, "hand", position] => {
             let position = match *position {
@@ -129,6 +128,28 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
         _ => return Err(format!("`{}` is not a command; there are\n{COMMANDS}", command.join(" "))),
     };
     Ok(Action::Stimulate { unit, stimulus })
+}
+
+/// `set 'input 0' 215`, with or without the quotes.
+fn parse_set(table: &str, address: &str, words: &[&str]) -> Result<Stimulus, String> {
+    let (table, address) = (table.trim_start_matches(['\'', '"']), address.trim_end_matches(['\'', '"']));
+    let known = || Table::ALL.map(|table| format!("`{table}`")).join(", ");
+    let found =
+        Table::from_name(table).ok_or_else(|| format!("`{table}` is no table; there are {}", known()))?;
+    let words = words.iter().map(|word| parse_word(word)).collect::<Result<Vec<u16>, String>>()?;
+    let first = parse_number("register", address)?;
+    let span = u16::try_from(words.len()).ok().and_then(|count| Span::with_count(found, first, count));
+    let span = span.ok_or_else(|| format!("there are fewer than {} words from {address} on", words.len()))?;
+    Ok(Stimulus::Set { span, words })
+}
+
+/// A register's word: `215`, `-5`, `0x00FF`.
+fn parse_word(text: &str) -> Result<u16, String> {
+    let hexadecimal = text.strip_prefix("0x").map(|digits| u16::from_str_radix(digits, 16).ok());
+    let decimal = || text.parse::<u16>().ok().or_else(|| text.parse::<i16>().ok().map(|word| word as u16));
+    hexadecimal
+        .unwrap_or_else(decimal)
+        .ok_or_else(|| format!("`{text}` is no word of a register, which holds -32768 to 65535"))
 }
 
 fn parse_measure(quantity: &str, value: &str) -> Result<Stimulus, String> {
@@ -240,6 +261,8 @@ mod tests {
                 0,
                 stimulate(5, Stimulus::Measure { quantity: Quantity::Door, value: 1.0 }),
             ),
+            ("unit 5 set 'input 0' 215", 0, stimulate(5, set(Table::Input, 0, &[215]))),
+            ("unit 5 set holding 9 -5 0x00FF", 0, stimulate(5, set(Table::Holding, 9, &[65531, 255]))),
             ("unit 5 motion", 0, stimulate(5, Stimulus::Motion)),
             ("unit 18 restart", 0, Action::Restart { unit: 18 }),
             (
@@ -264,6 +287,26 @@ mod tests {
         assert_eq!(told.len(), wanted.len(), "{told:?}");
         for ((line, error), (wanted_line, beginning)) in told.iter().zip(wanted) {
             assert!(*line == wanted_line && error.starts_with(beginning), "{line}: {error}");
+        }
+    }
+
+    fn set(table: Table, first: u16, words: &[u16]) -> Stimulus {
+        let span = Span::with_count(table, first, words.len() as u16).expect("a span");
+        Stimulus::Set { span, words: words.to_vec() }
+    }
+
+    #[test]
+    fn what_is_no_register_or_no_word_is_told() {
+        for (line, wanted) in [
+            ("unit 5 set 'register 0' 1", "`register` is no table; there are `coil`, `discrete`, `input`"),
+            ("unit 5 set 'input x' 1", "`x` is not a register; write a whole number"),
+            ("unit 5 set 'input 65535' 1 2", "there are fewer than 2 words from 65535 on"),
+            ("unit 5 set 'input 0' 65536", "`65536` is no word of a register, which holds -32768 to 65535"),
+            ("unit 5 set 'input 0' 0xG", "`0xG` is no word"),
+            ("unit 5 set 'input 0'", "`set 'input 0'` is not a command"),
+        ] {
+            let told = parse_line(line).unwrap_err();
+            assert!(told.starts_with(wanted), "{line}: {told}");
         }
     }
 

@@ -20,9 +20,10 @@ use anyhow::{Context, anyhow};
 
 use crate::edge::clock::Clock;
 use crate::engine::time::{Duration, Time};
-use crate::simulator::device::{DeviceAt, LineSettings, Stimulus};
+use crate::simulator::device::{DeviceAt, LineSettings, Place, Stimulus};
 use crate::simulator::fault::Fault;
 use crate::simulator::line::{Line, Transmission};
+use crate::simulator::plain::Plain;
 use crate::simulator::port::{PtyPort, TcpPort};
 use crate::simulator::script::{Action, Step, parse_line};
 use crate::simulator::store::Store;
@@ -56,7 +57,7 @@ impl Default for Options {
 /// A change that a person in front of a device would see.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Event {
-    pub device: DeviceAt,
+    pub device: Place,
     /// `relay_1`.
     pub output: String,
     /// `ON`.
@@ -80,21 +81,33 @@ impl Simulation {
     /// Switches the devices on. Errors: a unit that is there twice, a fault of a unit that is not
     /// there, a stored EEPROM that cannot be read.
     pub fn new(devices: &[DeviceAt], options: Options) -> anyhow::Result<Simulation> {
+        Simulation::with_profiles(devices, Vec::new(), options)
+    }
+
+    /// The same, with devices that are nothing but their profiles, each at its unit.
+    pub fn with_profiles(
+        devices: &[DeviceAt],
+        profiles: Vec<(Plain, u8)>,
+        options: Options,
+    ) -> anyhow::Result<Simulation> {
         let clock = Clock::start();
         let now = clock.now();
         let mut line = Line::new(now, options.line, options.turnaround, options.paced, devices)
             .map_err(|error| anyhow!(error))?;
+        for (device, unit) in profiles {
+            let at = Place { device: device.id().into(), unit };
+            line.add(at, Box::new(device)).map_err(|error| anyhow!(error))?;
+        }
         let mut store = match &options.state_dir {
             Some(directory) => Some(Store::open(directory).with_context(|| directory.display().to_string())?),
             None => None,
         };
         if let Some(store) = &mut store {
-            for device in devices {
-                if let Some(words) = store.load(*device).with_context(|| format!("EEPROM of {device}"))? {
-                    let unit = line.unit(device.unit).map_err(|error| anyhow!(error))?;
+            for unit in line.units_mut() {
+                if let Some(words) = store.load(&unit.at).with_context(|| format!("EEPROM of {}", unit.at))? {
                     unit.device
                         .load_eeprom(now, &words)
-                        .map_err(|error| anyhow!("EEPROM of {device}: {error}"))?;
+                        .map_err(|error| anyhow!("EEPROM of {}: {error}", unit.at))?;
                 }
             }
         }
@@ -275,7 +288,7 @@ impl State {
         let mut problems = Vec::new();
         if let Some(store) = &mut self.store {
             for unit in self.line.units() {
-                if let Err(error) = store.save(unit.at, &unit.device.eeprom()) {
+                if let Err(error) = store.save(&unit.at, &unit.device.eeprom()) {
                     problems.push(Told::Problem(format!("EEPROM of {}: {error}", unit.at)));
                 }
             }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::simulator::device::DeviceAt;
+use crate::simulator::device::Place;
 
 /// A directory with a file `metz-connect_mr-do4@18.eeprom` per device.
 #[derive(Debug)]
@@ -22,7 +22,7 @@ impl Store {
     }
 
     /// The stored EEPROM; `None` where there is none yet.
-    pub fn load(&mut self, device: DeviceAt) -> io::Result<Option<Vec<u16>>> {
+    pub fn load(&mut self, device: &Place) -> io::Result<Option<Vec<u16>>> {
         let path = self.path(device);
         let text = match std::fs::read_to_string(&path) {
             Ok(text) => text,
@@ -40,7 +40,7 @@ impl Store {
     }
 
     /// Stores the EEPROM if it has changed.
-    pub fn save(&mut self, device: DeviceAt, words: &[u16]) -> io::Result<()> {
+    pub fn save(&mut self, device: &Place, words: &[u16]) -> io::Result<()> {
         if self.stored.get(&device.unit).is_some_and(|stored| stored == words) {
             return Ok(());
         }
@@ -56,7 +56,7 @@ impl Store {
         Ok(())
     }
 
-    fn path(&self, device: DeviceAt) -> PathBuf {
+    fn path(&self, device: &Place) -> PathBuf {
         self.directory.join(format!("{}.eeprom", device.to_string().replace('/', "_")))
     }
 }

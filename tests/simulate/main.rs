@@ -59,6 +59,9 @@ fn wrong_arguments_end_with_2_and_say_what_would_be_right() {
         (&[MR_DO4, "--fault", "unit=19,silent"], "unit 19 is not on this line; there are 18"),
         (&[MR_DO4, "--parity", "odds"], "a parity is `even`, `odd` or `none`"),
         (&[MR_DO4, "--turnaround", "5"], "`5` is not a duration; write it as `80ms`"),
+        (&["--profile", "my.yaml"], "`my.yaml` names no unit; write it as `my-device.yaml@5`"),
+        (&["--profile", "my.yaml@0"], "`0` is not a unit; a unit is 1 to 247"),
+        (&["--profile", "/nowhere/my.yaml@5"], "cannot read the profile `/nowhere/my.yaml`"),
     ] {
         let with_door: Vec<&str> = match arguments.len() {
             0 => Vec::new(),
@@ -132,6 +135,102 @@ fn devices_are_served_obey_commands_tell_of_their_relays_and_leave_nothing_behin
     let mut stream = TcpStream::connect(&address).expect("connected");
     exchange(&mut stream, &[0, 3, 0, 0, 0, 6, 18, 1, 0, 0, 0, 4], &[0, 3, 0, 0, 0, 4, 18, 1, 1, 4]);
     simulation.end(Signal::INT);
+}
+
+/// Its cases are in a file beside it, as those of the shipped profiles are.
+const PROFILE: &str = "device: acme/thermostat
+manufacturer: Acme
+model: Thermostat
+source: invented
+identify: {at: input 9, equals: 0x5A00}
+points:
+  temperature: {at: input 0, type: i16, decimals: 1, unit: °C, poll: fast}
+  setpoint: {at: holding 0, decimals: 1, unit: °C, poll: slow, write: 5..30, default: 200, persistent: true}
+  mode: {at: holding 1, poll: slow, values: shared/modes, write: any}
+";
+
+#[test]
+fn a_profile_of_ones_own_is_served_beside_other_devices_and_read_back() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let (link, state) = (directory.path().join("line"), directory.path().join("state"));
+    std::fs::create_dir(directory.path().join("shared")).expect("a folder");
+    let shared = "1: {name: heat, unit: °C}\n2: {name: cool, unit: °C}\n";
+    std::fs::write(directory.path().join("shared/modes.yaml"), shared).expect("written");
+    let profile = directory.path().join("thermostat.yaml");
+    std::fs::write(&profile, PROFILE).expect("written");
+    let profile_at_19 = format!("{}@19", profile.display());
+    let pty = ["--pty", text(&link), "--state-dir", text(&state)];
+    let arguments = [&[MR_DO4, "--profile", profile_at_19.as_str()], &pty[..]].concat();
+    let mut simulation = Running::start(&arguments);
+    assert_eq!(simulation.next_line(), format!("pty {}", link.display()));
+
+    simulation.say("unit 19 set 'holding 1' 2");
+    simulation.wait_for("acme/thermostat@19 mode cool");
+    simulation.say("unit 19 set 'input 0' -55");
+    simulation.say("unit 18 relay 1 hand on");
+    simulation.wait_for("metz-connect/mr-do4@18 relay_1 ON");
+    // By hand, as raw registers of the one and the other device.
+    let by_hand = |verb: &str, unit: &str, rest: &[&str]| by_hand(verb, &link, unit, rest);
+    assert!(by_hand("read", "19", &["input 0"]).contains("-55"));
+    assert!(by_hand("read", "19", &["input 9"]).contains("5A00"));
+    assert!(by_hand("read", "18", &["coil 0..3"]).contains("coil 0  ON"));
+    assert!(by_hand("write", "19", &["holding 0", "225"]).contains("225"));
+    simulation.wait_for("acme/thermostat@19 setpoint 22.5");
+
+    // By the profile, as the gateway understands it.
+    let configuration = directory.path().join("busker.yaml");
+    let profiles = directory.path().join("profiles/acme");
+    std::fs::create_dir_all(&profiles).expect("a folder");
+    std::fs::create_dir(directory.path().join("profiles/shared")).expect("a folder");
+    std::fs::write(directory.path().join("profiles/shared/modes.yaml"), shared).expect("written");
+    std::fs::write(profiles.join("thermostat.yaml"), PROFILE).expect("written");
+    let told = format!(
+        "mqtt: {{url: mqtt://127.0.0.1}}
+profiles: [{}]
+buses: {{line: {{serial: {}, baud: 19200, parity: even}}}}
+devices: {{thermostat: {{profile: acme/thermostat, bus: line, unit: 19}}}}
+",
+        directory.path().join("profiles").display(),
+        link.display()
+    );
+    std::fs::write(&configuration, told).expect("written");
+    let by_name = ["--config", text(&configuration), "--device", "thermostat"];
+    for (point, wanted) in [("temperature", "-5.5"), ("setpoint", "22.5"), ("mode", "cool")] {
+        let told = succeed("read", &[&by_name[..], &[point]].concat());
+        assert!(told.contains(wanted), "{told}");
+    }
+    simulation.end(Signal::TERM);
+
+    // The setpoint was in the EEPROM, and nothing else.
+    let mut simulation = Running::start(&arguments);
+    assert_eq!(simulation.next_line(), format!("pty {}", link.display()));
+    assert!(by_hand("read", "19", &["holding 0"]).contains("225"));
+    assert!(by_hand("read", "19", &["holding 1"]).contains("0001"));
+    simulation.end(Signal::TERM);
+}
+
+#[test]
+fn faults_of_a_profile_are_told_with_their_places_and_nothing_is_started() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let profile = directory.path().join("my.yaml");
+    std::fs::write(&profile, PROFILE.replace("poll: fast", "poll: often")).expect("written");
+    let output = run(&["--profile", &format!("{}@5", profile.display()), "--tcp", "127.0.0.1:0"]);
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{told}");
+    assert!(told.contains(&format!("{}:7:", profile.display())), "{told}");
+    assert!(output.stdout.is_empty(), "{output:?}");
+}
+
+/// What `busker VERB` says of registers at a unit of the line.
+fn by_hand(verb: &str, link: &Path, unit: &str, rest: &[&str]) -> String {
+    succeed(verb, &[&["--serial", text(link), "--unit", unit], rest].concat())
+}
+
+fn succeed(verb: &str, arguments: &[&str]) -> String {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_busker"));
+    let output = command.arg(verb).args(arguments).output().expect("it starts");
+    assert!(output.status.success(), "{verb} {arguments:?}: {output:?}");
+    String::from_utf8(output.stdout).expect("text")
 }
 
 #[test]

@@ -135,7 +135,7 @@ fn check(mut library: Library, files: &[PathBuf]) -> Result<(), Failure> {
 }
 
 /// The files in `shared/` beside a profile, or beside its manufacturer's folder.
-fn add_shared_files_near(library: &mut Library, file: &Path) -> Result<(), Failure> {
+pub(super) fn add_shared_files_near(library: &mut Library, file: &Path) -> Result<(), Failure> {
     let folder = file.parent().unwrap_or(Path::new(""));
     for root in [folder.join(".."), folder.to_path_buf()] {
         let shared = root.join("shared");

@@ -161,7 +161,7 @@ fn changes_at_the_outputs_are_told_once() {
     let mut table = Table::new(Framing::Rtu);
     table.ask(18, &[5, 0, 1, 0xFF, 0]);
     let at = DeviceAt { model: Model::MrDo4, unit: 18 };
-    assert_eq!(table.line.changed_outputs(), [(at, "relay_2".into(), "ON".into())]);
+    assert_eq!(table.line.changed_outputs(), [(at.into(), "relay_2".into(), "ON".into())]);
     assert_eq!(table.line.changed_outputs(), []);
 }
 
