@@ -36,7 +36,7 @@ impl Plain {
     /// A device fresh from the factory: what has no default is 0, or the first of its names.
     pub fn new(device: Device) -> Plain {
         let mut cells = Cells::default();
-        let places = device.points.iter().flat_map(|point| cells::places(point)).map(|at| at.span);
+        let places = device.points.iter().flat_map(cells::places).map(|at| at.span);
         let identity = match &device.identify {
             Some(Identify::Word { at, .. }) => Some(*at),
             _ => None,
