@@ -18,6 +18,7 @@ use crate::simulator::metz_connect::mr_dio42::MrDio42;
 use crate::simulator::metz_connect::mr_do4::{MrDo4, MrDoa4};
 use crate::simulator::metz_connect::mr_si4::MrSi4;
 use crate::simulator::metz_connect::mr_to4::MrTo4;
+use crate::simulator::metz_connect::mr_tp::MrTp;
 
 /// A device on a line. It opens nothing, waits for nothing and is told the time; a caller may let
 /// any amount of time pass between two calls, but never lets it run backwards.
@@ -86,6 +87,8 @@ pub enum Overheard {
 pub enum Stimulus {
     /// A hand switch of a relay.
     Hand { relay: u8, position: Hand },
+    /// A switch with three positions, which mean what the device's mode makes of them.
+    Toggle { toggle: u8, position: Toggle },
     /// The hand operation of a voltage output: volts, or `None` for automatic.
     HandVolts { output: u8, volts: Option<f64> },
     /// What is connected to an input.
@@ -190,6 +193,14 @@ pub enum Hand {
     Off,
 }
 
+/// The position of a switch as it stands before one's eyes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Toggle {
+    Up,
+    Middle,
+    Down,
+}
+
 /// What an input sees.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Signal {
@@ -209,6 +220,17 @@ pub enum Signal {
     },
     /// Sets a pulse counter as if it had counted that far.
     Counter(u64),
+}
+
+impl Signal {
+    /// Whether a contact is closed; `None` for what is no contact.
+    pub fn contact(self) -> Option<bool> {
+        match self {
+            Signal::Contact(closed) => Some(closed),
+            Signal::Open => Some(false),
+            _ => None,
+        }
+    }
 }
 
 /// A line's bit rate and parity.
@@ -268,6 +290,7 @@ pub enum Model {
     MrCi4,
     MrTo4,
     MrDio42,
+    MrTp,
     BtrMrAi8,
     Relay8,
     AnalogOut8,
@@ -277,6 +300,7 @@ pub enum Model {
 
 impl Model {
     pub const ALL: [Model; 16] = [
+    pub const ALL: [Model; 15] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,
@@ -288,6 +312,7 @@ impl Model {
         Model::MrCi4,
         Model::MrTo4,
         Model::MrDio42,
+        Model::MrTp,
         Model::BtrMrAi8,
         Model::Relay8,
         Model::AnalogOut8,
@@ -309,6 +334,7 @@ impl Model {
             Model::MrCi4 => "metz-connect/mr-ci4",
             Model::MrTo4 => "metz-connect/mr-to4",
             Model::MrDio42 => "metz-connect/mr-dio42",
+            Model::MrTp => "metz-connect/mr-tp",
             Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
             Model::AnalogOut8 => "fuehlersysteme/analog-out8",
@@ -335,6 +361,7 @@ impl Model {
             Model::MrCi4 => Box::new(MetzConnect::new(now, line, MrCi4::new(now))),
             Model::MrTo4 => Box::new(MetzConnect::new(now, line, MrTo4::new(now))),
             Model::MrDio42 => Box::new(MetzConnect::new(now, line, MrDio42::new(now))),
+            Model::MrTp => Box::new(MetzConnect::new(now, line, MrTp::new(now))),
             Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
             Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),
@@ -467,6 +494,8 @@ mod tests {
             (proptest::sample::select(&Quantity::ALL[..]), -1e9..1e9f64)
                 .prop_map(|(quantity, value)| Stimulus::Measure { quantity, value }),
             (0..6u8).prop_map(|relay| Stimulus::Hand { relay, position: Hand::On }),
+            (0..4u8, proptest::sample::select(&[Toggle::Up, Toggle::Middle, Toggle::Down]))
+                .prop_map(|(toggle, position)| Stimulus::Toggle { toggle, position }),
             (0..6u8, 0.0..12.0f64)
                 .prop_map(|(output, volts)| Stimulus::HandVolts { output, volts: Some(volts) }),
             (0..10u8, any::<bool>()).prop_map(|(switch, on)| Stimulus::Dip { switch, on }),

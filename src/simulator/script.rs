@@ -10,6 +10,7 @@
 use crate::engine::address::{Span, Table};
 use crate::engine::time::Duration;
 use crate::simulator::device::{Hand, Quantity, Signal, Stimulus, parse_unit};
+use crate::simulator::device::{Hand, Signal, Stimulus, Toggle};
 use crate::simulator::fault::Fault;
 
 /// What a line of a script does.
@@ -33,6 +34,7 @@ pub struct Step {
 pub const COMMANDS: &str =
     "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4, MR-DIO4/2)
   unit N triac T hand on|off|automatic      a triac's hand switch (MR-TO4)
+  unit N toggle T up|middle|down            a switch with three positions (MR-TP)
   unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
   unit N input I ohms X | volts X | celsius X | open
                                             what is connected to an input (MR-AI8)
@@ -40,6 +42,7 @@ pub const COMMANDS: &str =
                                             what is connected to an input (MR-CI4, analog-in8)
   unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-DIO4/2,
                                             analog-in8)
+  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-TP, analog-in8)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
   unit N dip D on|off                       a DIP switch (MR-CI4)
@@ -114,6 +117,19 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
                 }
             };
             Stimulus::Hand { relay: parse_number("relay", relay)?, position }
+        }
+        ["toggle", toggle, position] => {
+            let position = match *position {
+                "up" => Toggle::Up,
+                "middle" => Toggle::Middle,
+                "down" => Toggle::Down,
+                other => {
+                    return Err(format!(
+                        "`{other}` is not a position of a switch; there are `up`, `middle`, `down`"
+                    ));
+                }
+            };
+            Stimulus::Toggle { toggle: parse_number("toggle", toggle)?, position }
         }
         ["dip", switch, state @ ("on" | "off")] => {
             Stimulus::Dip { switch: parse_number("switch", switch)?, on: *state == "on" }
@@ -240,6 +256,11 @@ mod tests {
             ),
             ("unit 20 button", 0, stimulate(20, Stimulus::Button)),
             ("unit 18 relay 2 hand on", 0, stimulate(18, Stimulus::Hand { relay: 2, position: Hand::On })),
+            (
+                "unit 22 toggle 2 middle",
+                0,
+                stimulate(22, Stimulus::Toggle { toggle: 2, position: Toggle::Middle }),
+            ),
             ("at 1.5s unit 18 power off", 1500, Action::Power { unit: 18, on: false }),
             (
                 "unit 21 output 2 hand 5.5",

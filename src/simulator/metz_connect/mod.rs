@@ -15,6 +15,7 @@ pub mod mr_dio42;
 pub mod mr_do4;
 pub mod mr_si4;
 pub mod mr_to4;
+pub mod mr_tp;
 mod sensors;
 mod switches;
 mod watchdog;
@@ -291,6 +292,7 @@ mod tests {
             (Model::MrAo4, metz_connect, "MR-AO4", "V1.4"),
             (Model::MrAop4, metz_connect, "MR-AOP4", "V1.5"),
             (Model::MrTo4, metz_connect, "MR-TO4", "V1.5"),
+            (Model::MrTp, metz_connect, "MR-TP", "V1.2"),
             (Model::MrCi4, metz_connect, "MR-CI4", "V1.4"),
             (Model::BtrMrAi8, "BTR", "MR-AI8", "V1.0"),
         ] {

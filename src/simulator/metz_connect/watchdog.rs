@@ -35,6 +35,11 @@ impl Watchdog {
         self.expired
     }
 
+    /// When it expires if no message comes; `None` when it is off or has expired.
+    pub fn expires_at(&self) -> Option<Time> {
+        (self.time > 0 && !self.expired).then(|| self.last_message + UNIT * self.time.into())
+    }
+
     /// True once each time it expires.
     pub fn expires(&mut self, now: Time) -> bool {
         let is_over = self.time > 0 && self.silence(now) >= UNIT * self.time.into();
