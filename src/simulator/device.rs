@@ -16,6 +16,7 @@ use crate::simulator::metz_connect::mr_ci4::MrCi4;
 use crate::simulator::metz_connect::mr_di::{MrDi4, MrDi10};
 use crate::simulator::metz_connect::mr_dio42::MrDio42;
 use crate::simulator::metz_connect::mr_do4::{MrDo4, MrDoa4};
+use crate::simulator::metz_connect::mr_ld6::MrLd6;
 use crate::simulator::metz_connect::mr_si4::MrSi4;
 use crate::simulator::metz_connect::mr_to4::MrTo4;
 use crate::simulator::metz_connect::mr_tp::MrTp;
@@ -291,6 +292,7 @@ pub enum Model {
     MrTo4,
     MrDio42,
     MrTp,
+    MrLd6,
     BtrMrAi8,
     Relay8,
     AnalogOut8,
@@ -313,6 +315,7 @@ impl Model {
         Model::MrTo4,
         Model::MrDio42,
         Model::MrTp,
+        Model::MrLd6,
         Model::BtrMrAi8,
         Model::Relay8,
         Model::AnalogOut8,
@@ -335,6 +338,7 @@ impl Model {
             Model::MrTo4 => "metz-connect/mr-to4",
             Model::MrDio42 => "metz-connect/mr-dio42",
             Model::MrTp => "metz-connect/mr-tp",
+            Model::MrLd6 => "metz-connect/mr-ld6",
             Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
             Model::AnalogOut8 => "fuehlersysteme/analog-out8",
@@ -362,6 +366,7 @@ impl Model {
             Model::MrTo4 => Box::new(MetzConnect::new(now, line, MrTo4::new(now))),
             Model::MrDio42 => Box::new(MetzConnect::new(now, line, MrDio42::new(now))),
             Model::MrTp => Box::new(MetzConnect::new(now, line, MrTp::new(now))),
+            Model::MrLd6 => Box::new(MetzConnect::new(now, line, MrLd6::new(now))),
             Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
             Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),

@@ -38,6 +38,7 @@ pub const COMMANDS: &str =
   unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
   unit N input I ohms X | volts X | celsius X | open
                                             what is connected to an input (MR-AI8)
+  unit N input I ohms X | volts X | open    a leak sensor, the voltage at its Zener diode (MR-LD6)
   unit N input I volts X | milliamps X | open
                                             what is connected to an input (MR-CI4, analog-in8)
   unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-DIO4/2,

@@ -13,6 +13,7 @@ pub mod mr_ci4;
 pub mod mr_di;
 pub mod mr_dio42;
 pub mod mr_do4;
+pub mod mr_ld6;
 pub mod mr_si4;
 pub mod mr_to4;
 pub mod mr_tp;
@@ -293,6 +294,7 @@ mod tests {
             (Model::MrAop4, metz_connect, "MR-AOP4", "V1.5"),
             (Model::MrTo4, metz_connect, "MR-TO4", "V1.5"),
             (Model::MrTp, metz_connect, "MR-TP", "V1.2"),
+            (Model::MrLd6, metz_connect, "MR-LD6", "V1.1"),
             (Model::MrCi4, metz_connect, "MR-CI4", "V1.4"),
             (Model::BtrMrAi8, "BTR", "MR-AI8", "V1.0"),
         ] {

@@ -40,6 +40,11 @@ impl Watchdog {
         (self.time > 0 && !self.expired).then(|| self.last_message + UNIT * self.time.into())
     }
 
+    /// Whether it has expired, and no message has come since.
+    pub fn has_expired(&self) -> bool {
+        self.expired
+    }
+
     /// True once each time it expires.
     pub fn expires(&mut self, now: Time) -> bool {
         let is_over = self.time > 0 && self.silence(now) >= UNIT * self.time.into();
