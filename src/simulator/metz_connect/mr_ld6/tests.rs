@@ -191,6 +191,8 @@ fn a_cable_breaks_above_102_5_percent_of_the_threshold_and_is_whole_below_97_5_p
     // 11 V for input 2, 6 V for input 5, whose 6.15 V and 5.85 V lie between two steps of 100 mV.
     write(&mut bench, 12, 60);
     bench.act("input 5 volts 5").expect("a sensor");
+    // And 20 V for input 6, whose 20.5 V and 19.5 V are such steps.
+    write(&mut bench, 13, 200);
     for (input, volts, breaks) in [
         (2, "11.2", 0x00),
         (2, "11.3", 0x02),
@@ -202,6 +204,10 @@ fn a_cable_breaks_above_102_5_percent_of_the_threshold_and_is_whole_below_97_5_p
         (5, "6.2", 0x10),
         (5, "5.9", 0x10),
         (5, "5.8", 0x00),
+        (6, "20.5", 0x00),
+        (6, "20.6", 0x20),
+        (6, "19.5", 0x20),
+        (6, "19.4", 0x00),
     ] {
         bench.act(&format!("input {input} volts {volts}")).expect("a sensor");
         let bits = format!("{breaks:02X}");
