@@ -210,12 +210,16 @@ impl<M: Module> SimulatedDevice for MetzConnect<M> {
             None
         } else {
             // Elsewhere the manual says of such a timer: it starts anew with each valid message to
-            // the device, only the address matters (pages 13 and 27). A broadcast is not addressed to it.
+            // the device, only the address matters (pages 13, 26 and 103). A broadcast is not addressed
+            // to it.
             if addressed == Addressed::Unit {
                 self.module.message_for_this_device(now);
             }
             self.answer(now, pdu).unwrap_or_else(|exception| {
-                self.counters.exceptions = self.counters.exceptions.wrapping_add(1);
+                // "Fehlerrückmeldungen die das Gerät … zurückgemeldet hat": to all is to nobody.
+                if addressed == Addressed::Unit {
+                    self.counters.exceptions = self.counters.exceptions.wrapping_add(1);
+                }
                 Some(exception_reply(pdu.first().copied().unwrap_or(0), exception))
             })
         };
@@ -344,6 +348,13 @@ mod tests {
             ("08 000B 0000", "08 000B 0001"),
             ("08 000D 0000", "08 000D 0000"),
         ]);
+    }
+
+    #[test]
+    fn an_exception_that_is_not_sent_is_not_counted_page_5() {
+        let mut bench = Bench::new(Model::MrDo4);
+        assert_eq!(bench.send(Addressed::Broadcast, "05 0009 FF00"), "silence");
+        bench.check(&[("08 000D 0000", "08 000D 0000"), ("08 000F 0000", "08 000F 0001")]);
     }
 
     #[test]
