@@ -301,8 +301,7 @@ pub enum Model {
 }
 
 impl Model {
-    pub const ALL: [Model; 16] = [
-    pub const ALL: [Model; 15] = [
+    pub const ALL: [Model; 18] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,

@@ -9,8 +9,7 @@
 
 use crate::engine::address::{Span, Table};
 use crate::engine::time::Duration;
-use crate::simulator::device::{Hand, Quantity, Signal, Stimulus, parse_unit};
-use crate::simulator::device::{Hand, Signal, Stimulus, Toggle};
+use crate::simulator::device::{Hand, Quantity, Signal, Stimulus, Toggle, parse_unit};
 use crate::simulator::fault::Fault;
 
 /// What a line of a script does.
@@ -41,9 +40,8 @@ pub const COMMANDS: &str =
   unit N input I ohms X | volts X | open    a leak sensor, the voltage at its Zener diode (MR-LD6)
   unit N input I volts X | milliamps X | open
                                             what is connected to an input (MR-CI4, analog-in8)
-  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-DIO4/2,
+  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-DIO4/2, MR-TP,
                                             analog-in8)
-  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-TP, analog-in8)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
   unit N dip D on|off                       a DIP switch (MR-CI4)

@@ -8,10 +8,6 @@ pub fn connect(contacts: &mut [bool], input: u8, signal: Signal, product: &str) 
     let Some(closed) = usize::from(input).checked_sub(1).and_then(|number| contacts.get_mut(number)) else {
         return Err(format!("input {input} is not there; {product} has 1 to {inputs}"));
     };
-    *closed = match signal {
-        Signal::Contact(closed) => closed,
-        Signal::Open => false,
-        _ => return Err(format!("an input of {product} takes a contact")),
-    };
+    *closed = signal.contact().ok_or_else(|| format!("an input of {product} takes a contact"))?;
     Ok(())
 }

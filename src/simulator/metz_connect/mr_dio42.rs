@@ -376,7 +376,7 @@ impl Module for MrDio42 {
     /// watchdog has expired (page 26).
     fn outputs(&self) -> Vec<(String, String)> {
         let coils = self.coils() as u8;
-        let led = if self.watchdog.is_expired() { "ON" } else { "OFF" };
+        let led = if self.watchdog.has_expired() { "ON" } else { "OFF" };
         let outputs = named("relay", coils).take(CHANNELS).chain(named("hand", coils >> 2).take(CHANNELS));
         outputs.chain([("red_led".to_string(), led.to_string())]).collect()
     }

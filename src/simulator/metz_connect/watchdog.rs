@@ -30,11 +30,6 @@ impl Watchdog {
         now.since(self.last_message)
     }
 
-    /// Whether it has expired and no message has come since.
-    pub fn is_expired(&self) -> bool {
-        self.expired
-    }
-
     /// When it expires if no message comes; `None` when it is off or has expired.
     pub fn expires_at(&self) -> Option<Time> {
         (self.time > 0 && !self.expired).then(|| self.last_message + UNIT * self.time.into())
