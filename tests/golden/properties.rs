@@ -139,8 +139,9 @@ fn check_reads(device: &Device, reads: &[Read], refused: &[Span]) -> Result<(), 
         let readable = wire.readable.is_empty() || wire.readable.iter().any(|span| span.contains(read.span));
         prop_assert!(readable, "{} is not readable", read.span);
         prop_assert!(!wire.forbidden.iter().any(|forbidden| forbidden.span.overlaps(read.span)));
+        let is_refused = |span: &&Span| read.points.len() > 1 && read.span.contains(**span);
+        prop_assert_eq!(refused.iter().find(is_refused), None, "{} was refused", read.span);
         for gap in read.gaps() {
-            prop_assert!(!refused.iter().any(|span| span.overlaps(gap)), "{gap} was refused");
             let widest = wire.limits.gap.map_or(u32::MAX, u32::from);
             prop_assert!(gap.count() <= widest, "{gap} is bridged");
         }
