@@ -84,7 +84,8 @@ fn writable(device: &Device) -> impl Iterator<Item = (&Device, usize, &Write)> {
         .map(move |(index, write)| (device, index, write))
 }
 
-/// What the point's selectors hold: any value that their names or ranges give.
+/// What the point's selectors hold: any value that their names or ranges give, and with which the point
+/// lives.
 fn some_state(device: &Device, index: usize, selected: &prop::sample::Index) -> Vec<Option<i128>> {
     let mut known = vec![None; device.points.len()];
     for selector in device.points[index].selectors() {
@@ -93,6 +94,9 @@ fn some_state(device: &Device, index: usize, selected: &prop::sample::Index) -> 
         let mut possible: Vec<i128> = names.iter().map(|(raw, _)| *raw).collect();
         if let Some(WriteRule::Range { min, max, .. }) = point.write.as_ref().map(|write| &write.rule) {
             possible.extend(min.units..=max.units);
+        }
+        for condition in device.points[index].when.iter().filter(|condition| condition.point == selector) {
+            possible.retain(|raw| condition.holds(*raw));
         }
         known[selector] = Some(*selected.get(&possible));
     }

@@ -39,10 +39,10 @@ pub fn answered(device: &Device, file: &str) -> String {
     text
 }
 
-/// The points that are read, their cases and their named values, that no scene has a reading of.
+/// The points that can be read, their cases and their named values, that no scene has a reading of.
 pub fn without_a_reading(device: &Device, file: &str) -> Vec<String> {
     let mut wanted = BTreeSet::new();
-    for point in device.points.iter().filter(|point| point.is_read()) {
+    for point in device.points.iter().filter(|point| !point.is_button()) {
         wanted.insert(point.name.clone());
         match &point.encoding {
             // The forms of other points, each of which has a reading of its own.
@@ -139,7 +139,7 @@ impl Scene {
     fn readings(&self, device: &Device) -> Vec<Told> {
         let known = self.known(device);
         let mut told = Vec::new();
-        for (index, point) in device.points.iter().enumerate().filter(|(_, point)| point.is_read()) {
+        for (index, point) in device.points.iter().enumerate().filter(|(_, point)| !point.is_button()) {
             let mut places = [Some(point.at), point.also].into_iter().flatten();
             let found = |place: Address| Some((place, self.words(place)?));
             let Some((place, words)) = places.find_map(found) else { continue };
@@ -175,6 +175,9 @@ impl Scene {
     }
 }
 
+/// Registers of a text, or of the longest number twice.
+const LONGEST: usize = 8;
+
 fn in_words(reading: &Reading, unit: Option<&str>) -> String {
     match (reading, unit) {
         (Reading::Missing(missing), _) => format!("None ({missing})"),
@@ -183,12 +186,14 @@ fn in_words(reading: &Reading, unit: Option<&str>) -> String {
     }
 }
 
-/// With as many digits as the place has bits.
+/// With as many digits as the place has bits. Of an array only the beginning.
 fn in_hex(place: Address, words: &[u16]) -> String {
     let digits = match place.bits {
         Some(bits) => usize::from(bits.width()).div_ceil(4),
         None if place.span.table().is_bits() => 1,
         None => 4,
     };
-    words.iter().map(|word| format!("{word:0digits$X}")).collect()
+    let end = if words.len() > LONGEST { "…" } else { "" };
+    let begin: String = words.iter().take(LONGEST).map(|word| format!("{word:0digits$X}")).collect();
+    format!("{begin}{end}")
 }
