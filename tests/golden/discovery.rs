@@ -20,6 +20,39 @@ const STATES: &[State] = &[
     ("metz-connect/mr-ai8", "pt1000 as integer, °F", &[("code", 0x85), ("temperature_unit", 1)]),
     ("metz-connect/mr-ai8", "resistance in steps of 100 ohms", &[("code", 0x44)]),
     ("metz-connect/mr-ai8", "interpolation table, °F", &[("code", 0xF9), ("temperature_unit", 1)]),
+    (
+        "metz-connect/mr-aio42",
+        "controller 1 a heater, output 2 in percent",
+        &[
+            ("controller_1_setpoint_source", 2),
+            ("output_1_source", 2),
+            ("channel_1_code", 0x84),
+            ("output_2_source", 1),
+        ],
+    ),
+    (
+        "metz-connect/mr-aio42",
+        "controller 2 a cooler, output 1 by controller 1 with a setpoint of input 2",
+        &[
+            ("controller_2_setpoint_source", 2),
+            ("controller_2_action", 0),
+            ("output_1_source", 2),
+            ("output_2_source", 2),
+            ("channel_3_code", 0x95),
+        ],
+    ),
+    (
+        "metz-connect/mr-aio42",
+        "controller 1 a heater by hand",
+        &[
+            ("controller_1_setpoint_source", 2),
+            ("controller_1_manual", 1),
+            ("output_1_source", 2),
+            ("channel_1_code", 0x84),
+        ],
+    ),
+    ("metz-connect/mr-multi-io", "pt1000 as float, °F", &[("channel_1_code", 0x84), ("temperature_unit", 1)]),
+    ("metz-connect/mr-multi-io", "current as integer", &[("current_code", 1)]),
     ("metz-connect/mr-si4", "three decimals", &[("decimals", 3)]),
 ];
 

@@ -1,14 +1,17 @@
 //! The expanded points as a table for people, with the long lists below it.
 
 use busker::engine::device::{
-    Decimals, Device, Encoding, Form, Kind, Names, Point, Unit, Write, WriteFunction, WriteRule,
+    Condition, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Thing, Unit, Write,
+    WriteFunction, WriteRule,
 };
+use busker::engine::time::Duration;
 use busker::engine::value::Decimal;
 
 /// Lists of more names than this stand below the table, once for all points that share them.
 const NAMES_IN_LINE: usize = 3;
 
-/// A line a point: name, place, meaning, poll class, how it is written, what else.
+/// A line a point: name, place, meaning, poll class, how it is written, what else. Below: long lists,
+/// things, and what is left out.
 pub fn table(device: &Device) -> String {
     let mut lists = Vec::new();
     let rows: Vec<[String; 5]> = device.points.iter().map(|point| row(device, point, &mut lists)).collect();
@@ -26,6 +29,9 @@ pub fn table(device: &Device) -> String {
     }
     for (index, list) in lists.iter().enumerate() {
         text.push_str(&format!("\n[{}]\n{list}", index + 1));
+    }
+    for thing in &device.things {
+        text.push_str(&format!("\n{}\n", in_lines(device, thing)));
     }
     if !device.left_out.is_empty() {
         text.push_str("\nleft out\n");
@@ -62,6 +68,9 @@ fn row(device: &Device, point: &Point, lists: &mut Vec<String>) -> [String; 5] {
 
 fn meaning(device: &Device, form: &Form, lists: &mut Vec<String>) -> String {
     let mut words = vec![form.kind.name()];
+    if form.elements > 1 {
+        words.push(format!("array of {}", form.elements));
+    }
     if form.scale != Decimal::ONE {
         words.push(format!("× {}", form.scale));
     }
@@ -126,6 +135,12 @@ fn writing(point: &Point, write: &Write) -> String {
     if let Some(function) = write.with {
         words.push(format!("with function {}", WriteFunction::code(function)));
     }
+    if let Some(between) = write.on_change {
+        words.push(format!("with {between} between two equal ones"));
+    }
+    if write.settle > Duration::ZERO {
+        words.push(format!("and wait {} ms", write.settle.as_micros() / 1000));
+    }
     words.join(" ")
 }
 
@@ -150,5 +165,45 @@ fn more(device: &Device, point: &Point) -> String {
             point.re_read.len()
         )),
     }
+    if let Some(time) = point.heartbeat {
+        words.push(format!("repeated within {}", device.points[time].name));
+    }
+    if let Some(registers) = point.refers {
+        words.push(format!("names a point of {registers}"));
+    }
+    if let Some(event) = &point.event {
+        words.push(format!("each flip is the event {event}"));
+    }
+    if !point.when.is_empty() {
+        words.push(conditions(device, &point.when));
+    }
     words.iter().map(|word| format!("; {word}")).collect()
+}
+
+/// `only while mode is direct or logic, and …`
+fn conditions(device: &Device, when: &[Condition]) -> String {
+    let each = when.iter().map(|condition| {
+        let values: Vec<&str> = condition.values.iter().map(|(_, name)| name.as_str()).collect();
+        format!("{} is {}", device.points[condition.point].name, values.join(" or "))
+    });
+    format!("only while {}", each.collect::<Vec<_>>().join(", and "))
+}
+
+/// A thing with its conditions, its points, and a line for each state and command.
+fn in_lines(device: &Device, thing: &Thing) -> String {
+    let name = |point: PointIndex| device.points[point].name.as_str();
+    let row = |row: &[(PointIndex, String)]| {
+        let each = row.iter().map(|(point, value)| format!("{} {value}", name(*point)));
+        each.collect::<Vec<_>>().join(", ")
+    };
+    let mut lines = vec![format!("{}: {}", thing.name, thing.kind.name())];
+    if !thing.when.is_empty() {
+        lines.push(conditions(device, &thing.when));
+    }
+    lines.extend(thing.temperature.map(|point| format!("temperature {}", name(point))));
+    lines.extend(thing.target.map(|point| format!("target {}", name(point))));
+    lines.extend(thing.states.iter().map(|state| format!("is {} with {}", state.name, row(&state.row))));
+    let commands = thing.commands.iter();
+    lines.extend(commands.map(|command| format!("does {} by {}", command.name, row(&command.orders))));
+    lines.join("\n  ")
 }
