@@ -27,8 +27,11 @@ use world::World;
 /// Starts simulated devices on pseudo-terminals, a mosquitto on a free port and the gateway, and shows
 /// what the devices say. Ends on interrupt, with everything that it has started.
 #[derive(clap::Args, Debug)]
-#[command(after_help = "Example:\n  busker demo --http 127.0.0.1:8485")]
+#[command(after_help = "Examples:\n  busker demo --http 127.0.0.1:8485\n  busker demo --all")]
 pub struct Args {
+    /// Every device that there is, on three lines, instead of four devices on two
+    #[arg(long)]
+    all: bool,
     /// Where the broker listens, instead of a free port
     #[arg(long, value_name = "ADDRESS:PORT")]
     mqtt: Option<SocketAddr>,
@@ -37,11 +40,15 @@ pub struct Args {
     http: SocketAddr,
 }
 
-/// A line with its devices, each by profile and unit.
-const LINES: [(&str, &[(&str, u8)]); 2] = [
-    ("basement", &[("metz-connect/mr-do4", 18), ("metz-connect/mr-ai8", 19), ("metz-connect/mr-si4", 20)]),
-    ("attic", &[("fuehlersysteme/relay8", 21)]),
-];
+/// The lines of a demo of few devices, each with the devices on it.
+const FEW: [(&str, &[Model]); 2] =
+    [("basement", &[Model::MrDo4, Model::MrAi8, Model::MrSi4]), ("attic", &[Model::Relay8])];
+
+/// The lines of a demo of all devices, which are dealt to them in turn.
+const LINES_OF_ALL: [&str; 3] = ["basement", "attic", "plant"];
+
+/// The first device's unit; each further one has the next.
+const FIRST_UNIT: u8 = 18;
 
 /// How often the world moves on and the screen is looked at.
 const TICK: Duration = Duration::from_millis(250);
@@ -55,8 +62,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     if !std::io::stdout().is_terminal() {
         log::start();
     }
-    let lines = LINES.map(|(name, devices)| Line::start(name, devices));
-    let lines: Vec<Line> = lines.into_iter().collect::<anyhow::Result<_>>()?;
+    let lines = start_lines(args.all)?;
     let mut mosquitto = Mosquitto::start(args.mqtt)?;
     let settings = settings(&lines, mosquitto.address(), args.http)?;
     let mut screen = Screen::new(&settings, &mosquitto);
@@ -102,6 +108,25 @@ fn show(
     }
 }
 
+fn start_lines(all: bool) -> anyhow::Result<Vec<Line>> {
+    let on_lines: Vec<(&str, Vec<Model>)> = if all {
+        let dealt = |line: usize| Model::ALL.into_iter().skip(line).step_by(LINES_OF_ALL.len()).collect();
+        LINES_OF_ALL.into_iter().enumerate().map(|(line, name)| (name, dealt(line))).collect()
+    } else {
+        FEW.iter().map(|(name, models)| (*name, models.to_vec())).collect()
+    };
+    let mut units = FIRST_UNIT..;
+    on_lines
+        .into_iter()
+        .map(|(name, models)| {
+            Line::start(
+                name,
+                models.into_iter().zip(&mut units).map(|(model, unit)| DeviceAt { model, unit }).collect(),
+            )
+        })
+        .collect()
+}
+
 /// The configuration, as a person would write it for these devices.
 fn settings(lines: &[Line], broker: SocketAddr, http: SocketAddr) -> anyhow::Result<Settings> {
     let mut text = format!("mqtt: {{url: 'mqtt://{broker}'}}\nhttp: {{listen: '{http}'}}\n");
@@ -140,14 +165,7 @@ struct Line {
 }
 
 impl Line {
-    fn start(name: &'static str, devices: &[(&str, u8)]) -> anyhow::Result<Line> {
-        let devices: Vec<DeviceAt> = devices
-            .iter()
-            .map(|(id, unit)| {
-                let model = Model::from_id(id).with_context(|| format!("`{id}` is not simulated"))?;
-                anyhow::Ok(DeviceAt { model, unit: *unit })
-            })
-            .collect::<anyhow::Result<_>>()?;
+    fn start(name: &'static str, devices: Vec<DeviceAt>) -> anyhow::Result<Line> {
         // The times of a real wire, so that what is seen is what hardware would do.
         let options = Options { paced: true, ..Options::default() };
         let simulation = Simulation::new(&devices, options)?;
