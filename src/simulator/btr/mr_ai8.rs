@@ -4,7 +4,7 @@
 use crate::engine::time::Time;
 use crate::simulator::device::Stimulus;
 use crate::simulator::metz_connect::Module;
-use crate::simulator::metz_connect::analog_inputs::{AnalogInputs, REGISTERS, check_codes};
+use crate::simulator::metz_connect::analog_inputs::{AnalogInputs, REGISTERS};
 use crate::simulator::metz_connect::channel::Code;
 use crate::simulator::metz_connect::holding::HoldingRegisters;
 use crate::simulator::pdu::{Exception, Request, check_span};
@@ -39,7 +39,7 @@ impl HoldingRegisters for MrAi8 {
     }
 
     fn write(&mut self, now: Time, first: u16, words: &[u16]) -> Result<(), Exception> {
-        check_codes(first, words, is_code)?;
+        self.inputs.check_codes(first, words, is_code)?;
         for (register, word) in (first..).zip(words) {
             self.inputs.write(now, register, *word);
         }
@@ -70,12 +70,13 @@ impl Module for MrAi8 {
     }
 
     fn restart(&mut self, now: Time) {
+        self.inputs.clear_offsets();
         self.inputs.restart(now);
         self.advance(now);
     }
 
     fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String> {
-        self.inputs.stimulate(stimulus)?;
+        self.inputs.stimulate(Self::PRODUCT, stimulus)?;
         self.advance(now);
         Ok(())
     }

@@ -1,20 +1,20 @@
-//! Eight inputs for voltage, resistance and temperature: what the chapters MR-AI8 of METZ CONNECT
-//! (pages 48 to 57) and of BTR (section 10.1) agree on.
+//! Inputs for voltage, resistance and temperature: what the chapters MR-AI8 of METZ CONNECT (pages 48
+//! to 57) and of BTR (section 10.1) agree on, and MR-AIO4/2 (pages 62 to 69) with half as many.
 
 use crate::engine::time::{Duration, Time};
 use crate::simulator::device::{Signal, Stimulus, take_words};
-use crate::simulator::metz_connect::channel::{Code, Format, measure, raw_words};
+use crate::simulator::metz_connect::channel::{Code, Format, float, measure, quantity, raw_words};
 use crate::simulator::pdu::{Exception, check_span, words_reply};
 
-/// The inputs, with registers 0 to 63.
-pub struct AnalogInputs {
-    /// Registers 0 to 15. Of all settings only these are not marked as EEPROM: a restart clears them.
-    offsets: [u16; 2 * INPUTS],
-    /// Registers 16 to 23. EEPROM.
-    codes: [u16; INPUTS],
+/// `N` inputs, with the registers from 0 to 63 that are about them.
+pub struct AnalogInputs<const N: usize = INPUTS> {
+    /// Two registers for each input from 0 on. Whether they are EEPROM, the devices do not agree on.
+    offsets: [[u16; 2]; N],
+    /// A register for each input from 16 on. EEPROM.
+    codes: [u16; N],
     /// Registers 24 to 63: temperature and resistance of ten points, each a float. EEPROM.
     table: [u16; TABLE_WORDS],
-    inputs: [Input; INPUTS],
+    inputs: [Input; N],
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -24,9 +24,11 @@ struct Input {
     ready_at: Time,
     /// The two registers of the measured value.
     words: [u16; 2],
+    /// The same in volts, ohms or degrees Celsius.
+    quantity: f64,
 }
 
-/// How many inputs there are.
+/// How many inputs MR-AI8 has.
 pub const INPUTS: usize = 8;
 /// The offsets, the codes and the table.
 pub const REGISTERS: (u16, u16) = (0, 63);
@@ -36,27 +38,23 @@ const TABLE: u16 = 24;
 /// "Solange noch keine Messung erfolgt ist, ist der Messwert 0"; the manuals name no time for it.
 const FIRST_MEASUREMENT: Duration = Duration::from_millis(250);
 
-impl AnalogInputs {
-    pub fn new(now: Time) -> AnalogInputs {
-        let input = Input { signal: Signal::Open, ready_at: now + FIRST_MEASUREMENT, words: [0; 2] };
-        AnalogInputs {
-            offsets: [0; 2 * INPUTS],
-            codes: [0; INPUTS],
-            table: [0; TABLE_WORDS],
-            inputs: [input; INPUTS],
-        }
+impl<const N: usize> AnalogInputs<N> {
+    pub fn new(now: Time) -> AnalogInputs<N> {
+        let ready_at = now + FIRST_MEASUREMENT;
+        let input = Input { signal: Signal::Open, ready_at, words: [0; 2], quantity: 0.0 };
+        AnalogInputs { offsets: [[0; 2]; N], codes: [0; N], table: [0; TABLE_WORDS], inputs: [input; N] }
     }
 
-    /// One of the registers 0 to 63.
+    /// One of the registers of offsets, codes and table.
     pub fn read(&self, register: u16) -> u16 {
         match register {
             TABLE.. => self.table[usize::from(register - TABLE)],
             CODES.. => self.codes[usize::from(register - CODES)],
-            _ => self.offsets[usize::from(register)],
+            _ => self.offsets.as_flattened()[usize::from(register)],
         }
     }
 
-    /// Writes one of the registers 0 to 63; a code has been checked by [`check_codes`].
+    /// Writes one of the same registers; a code has been checked by [`AnalogInputs::check_codes`].
     pub fn write(&mut self, now: Time, register: u16, word: u16) {
         match register {
             TABLE.. => self.table[usize::from(register - TABLE)] = word,
@@ -64,30 +62,35 @@ impl AnalogInputs {
                 let number = usize::from(register - CODES);
                 // Another circuit or sensor has to measure first; bit 8 only turns a comparison.
                 if (self.codes[number] ^ word) & 0xFF != 0 {
-                    self.inputs[number].ready_at = now + FIRST_MEASUREMENT;
+                    self.inputs[number].begin(now);
                 }
                 self.codes[number] = word;
             }
-            _ => self.offsets[usize::from(register)] = word,
+            _ => self.offsets.as_flattened_mut()[usize::from(register)] = word,
         }
     }
 
-    /// Measures all inputs.
+    /// Measures all inputs that are ready.
     pub fn measure(&mut self, now: Time, fahrenheit: bool) {
-        for number in 0..INPUTS {
-            let (code, input) = (self.code(number), self.inputs[number]);
-            let offset = [self.offsets[2 * number], self.offsets[2 * number + 1]];
-            self.inputs[number].words = if now < input.ready_at {
-                [0; 2]
-            } else {
-                raw_words(code, measure(code, input.signal, &self.table, fahrenheit), offset)
-            };
+        for number in 0..N {
+            if now >= self.inputs[number].ready_at {
+                self.measure_one(number, fahrenheit);
+            }
         }
     }
 
-    /// Answers function 4 for registers 0 to 15.
+    /// Measures one input, whose turn it is.
+    pub fn measure_one(&mut self, number: usize, fahrenheit: bool) {
+        let (code, offset) = (self.code(number), self.offsets[number]);
+        let input = &mut self.inputs[number];
+        let value = measure(code, input.signal, &self.table, fahrenheit);
+        input.words = raw_words(code, value, offset);
+        input.quantity = quantity(code, value, offset, fahrenheit);
+    }
+
+    /// Answers function 4 for the two registers of each value from 0 on.
     pub fn read_values(&self, first: u16, count: u16) -> Result<Vec<u8>, Exception> {
-        check_span(first, count.into(), 2 * INPUTS, (0, 15))?;
+        check_span(first, count.into(), 2 * N, (0, 2 * N as u16 - 1))?;
         let words: Vec<u16> = self.inputs.iter().flat_map(|input| input.words).collect();
         Ok(words_reply(4, &words[usize::from(first)..usize::from(first + count)]))
     }
@@ -108,37 +111,46 @@ impl AnalogInputs {
         self.inputs[number].words
     }
 
-    pub fn restart(&mut self, now: Time) {
-        self.offsets = [0; 2 * INPUTS];
-        for input in &mut self.inputs {
-            input.ready_at = now + FIRST_MEASUREMENT;
-        }
+    /// The value in volts, ohms or degrees Celsius; 0 where nothing has been measured yet.
+    pub fn quantity(&self, number: usize) -> f64 {
+        self.inputs[number].quantity
     }
 
-    pub fn stimulate(&mut self, stimulus: &Stimulus) -> Result<(), String> {
+    /// Of MR-AI8's settings only the offsets are not marked as EEPROM (page 50): a restart clears them.
+    pub fn clear_offsets(&mut self) {
+        self.offsets = [[0; 2]; N];
+    }
+
+    pub fn restart(&mut self, now: Time) {
+        self.inputs.iter_mut().for_each(|input| input.begin(now));
+    }
+
+    pub fn stimulate(&mut self, device: &str, stimulus: &Stimulus) -> Result<(), String> {
         match *stimulus {
-            Stimulus::Input { input: number @ 1..=8, signal } => {
+            Stimulus::Input { input, signal } if (1..=N).contains(&input.into()) => {
                 if !matches!(signal, Signal::Open | Signal::Ohms(_) | Signal::Volts(_) | Signal::Celsius(_)) {
-                    return Err("an input of MR-AI8 takes ohms, volts, celsius or open".into());
+                    return Err(format!("an input of {device} takes ohms, volts, celsius or open"));
                 }
-                self.inputs[usize::from(number) - 1].signal = signal;
+                self.inputs[usize::from(input) - 1].signal = signal;
                 Ok(())
             }
-            Stimulus::Input { input, .. } => Err(format!("input {input} is not there; MR-AI8 has 1 to 8")),
-            _ => Err("MR-AI8 has inputs and nothing else to touch".into()),
+            Stimulus::Input { input, .. } => {
+                Err(format!("input {input} is not there; {device} has 1 to {N}"))
+            }
+            _ => Err(format!("{device} has inputs and nothing else to touch")),
         }
     }
 
     /// What a person who could read registers would see.
     pub fn outputs(&self) -> Vec<(String, String)> {
         let text = |number: usize| {
-            let [high, low] = self.value(number);
+            let words = self.value(number);
             match self.code(number).format {
-                Format::Float => f32::from_bits(u32::from(high) << 16 | u32::from(low)).to_string(),
-                Format::Integer { .. } => (high as i16).to_string(),
+                Format::Float => float(words).to_string(),
+                Format::Integer { .. } => (words[0] as i16).to_string(),
             }
         };
-        (0..INPUTS).map(|number| (format!("input_{}", number + 1), text(number))).collect()
+        (0..N).map(|number| (format!("input_{}", number + 1), text(number))).collect()
     }
 
     pub fn eeprom(&self) -> Vec<u16> {
@@ -150,10 +162,25 @@ impl AnalogInputs {
         self.codes = take_words(words);
         self.table = take_words(words);
     }
+
+    /// Refuses a write that holds a reserved code: it has no meaning that could be measured.
+    pub fn check_codes(
+        &self,
+        first: u16,
+        words: &[u16],
+        is_code: impl Fn(u16) -> bool,
+    ) -> Result<(), Exception> {
+        let registers = CODES..CODES + N as u16;
+        let mut codes = (first..).zip(words).filter(|(register, _)| registers.contains(register));
+        if codes.all(|(_, word)| is_code(*word)) { Ok(()) } else { Err(Exception::Value) }
+    }
 }
 
-/// Refuses a write that holds a reserved code: it has no meaning that could be measured.
-pub fn check_codes(first: u16, words: &[u16], is_code: impl Fn(u16) -> bool) -> Result<(), Exception> {
-    let mut codes = (first..).zip(words).filter(|(register, _)| (CODES..TABLE).contains(register));
-    if codes.all(|(_, word)| is_code(*word)) { Ok(()) } else { Err(Exception::Value) }
+impl Input {
+    /// Forgets what was measured: the device has started, or the input has a new configuration.
+    fn begin(&mut self, now: Time) {
+        self.ready_at = now + FIRST_MEASUREMENT;
+        self.words = [0; 2];
+        self.quantity = 0.0;
+    }
 }

@@ -1,5 +1,6 @@
-//! One input of MR-AI8: from its configuration register and what is connected to the words of its
-//! measured value (Softwarebeschreibung Modbus RTU V2.1, pages 51 to 57).
+//! One analog input: from its configuration register and what is connected to the words of its
+//! measured value (Softwarebeschreibung Modbus RTU V2.1, pages 51 to 57; the same again for MR-AIO4/2
+//! on pages 64 to 68).
 
 use crate::simulator::device::Signal;
 use crate::simulator::metz_connect::sensors::{Quantity, Sensor};
@@ -130,15 +131,26 @@ pub fn measure(code: Code, signal: Signal, table: &[u16], fahrenheit: bool) -> f
 /// The value's two registers, with the offset added, which has the value's own format.
 pub fn raw_words(code: Code, value: f64, offset: [u16; 2]) -> [u16; 2] {
     match code.format {
-        Format::Float => {
-            let bits = (value as f32 + float(offset)).to_bits();
-            [(bits >> 16) as u16, bits as u16]
-        }
+        Format::Float => float_words(value as f32 + float(offset)),
         Format::Integer { per_unit } => {
             // What does not fit is told as the largest number that does: the cast saturates.
             let steps = (value * per_unit).round() as i16;
             [steps.saturating_add(offset[0] as i16) as u16, 0]
         }
+    }
+}
+
+/// The value with its offset as a number in volts, ohms or degrees Celsius, whatever the registers tell
+/// it in: what controllers within the device work with (page 76).
+pub fn quantity(code: Code, value: f64, offset: [u16; 2], fahrenheit: bool) -> f64 {
+    let told = value
+        + match code.format {
+            Format::Float => f64::from(float(offset)),
+            Format::Integer { per_unit } => f64::from(offset[0] as i16) / per_unit,
+        };
+    match code.meaning {
+        Meaning::Sensor(_) if fahrenheit => (told - 32.0) / 1.8,
+        _ => told,
     }
 }
 
@@ -153,8 +165,15 @@ pub fn is_above(format: Format, value: [u16; 2], on: [u16; 2], off: [u16; 2], be
     if value > number(on) { true } else { before && value >= number(off) }
 }
 
-fn float(words: [u16; 2]) -> f32 {
+/// The float in two registers, the higher half first (pages 49 and 60).
+pub fn float(words: [u16; 2]) -> f32 {
     f32::from_bits(u32::from(words[0]) << 16 | u32::from(words[1]))
+}
+
+/// A float as two registers.
+pub fn float_words(number: f32) -> [u16; 2] {
+    let bits = number.to_bits();
+    [(bits >> 16) as u16, bits as u16]
 }
 
 /// The table's points, up to the first that is 0, 0: temperature and what is measured (page 56).

@@ -4,7 +4,7 @@
 use crate::engine::time::Time;
 use crate::simulator::device::{Stimulus, take_words};
 use crate::simulator::metz_connect::Module;
-use crate::simulator::metz_connect::analog_inputs::{AnalogInputs, INPUTS, REGISTERS, check_codes};
+use crate::simulator::metz_connect::analog_inputs::{AnalogInputs, INPUTS, REGISTERS};
 use crate::simulator::metz_connect::channel::{Code, is_above};
 use crate::simulator::metz_connect::holding::HoldingRegisters;
 use crate::simulator::pdu::{Exception, Request, bits_reply, check_span, words_reply, write_reply};
@@ -70,7 +70,7 @@ impl HoldingRegisters for MrAi8 {
     }
 
     fn write(&mut self, now: Time, first: u16, words: &[u16]) -> Result<(), Exception> {
-        check_codes(first, words, |word| Code::parse(word).is_some())?;
+        self.inputs.check_codes(first, words, |word| Code::parse(word).is_some())?;
         for (register, word) in (first..).zip(words) {
             match register {
                 UNIT => self.fahrenheit = word & 1 == 1,
@@ -125,13 +125,14 @@ impl Module for MrAi8 {
     }
 
     fn restart(&mut self, now: Time) {
+        self.inputs.clear_offsets();
         self.inputs.restart(now);
         self.above = [false; INPUTS];
         self.measure(now);
     }
 
     fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String> {
-        self.inputs.stimulate(stimulus)?;
+        self.inputs.stimulate(Self::PRODUCT, stimulus)?;
         self.measure(now);
         Ok(())
     }
