@@ -11,6 +11,7 @@ use crate::simulator::fuehlersysteme::relay8::Relay8;
 use crate::simulator::fuehlersysteme::sensor::Sensor;
 use crate::simulator::metz_connect::MetzConnect;
 use crate::simulator::metz_connect::mr_ai8::MrAi8;
+use crate::simulator::metz_connect::mr_aio42::MrAio42;
 use crate::simulator::metz_connect::mr_ao4::{MrAo4, MrAop4};
 use crate::simulator::metz_connect::mr_ci4::MrCi4;
 use crate::simulator::metz_connect::mr_di::{MrDi4, MrDi10};
@@ -293,6 +294,7 @@ pub enum Model {
     MrDio42,
     MrTp,
     MrLd6,
+    MrAio42,
     BtrMrAi8,
     Relay8,
     AnalogOut8,
@@ -301,7 +303,7 @@ pub enum Model {
 }
 
 impl Model {
-    pub const ALL: [Model; 18] = [
+    pub const ALL: [Model; 19] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,
@@ -315,6 +317,7 @@ impl Model {
         Model::MrDio42,
         Model::MrTp,
         Model::MrLd6,
+        Model::MrAio42,
         Model::BtrMrAi8,
         Model::Relay8,
         Model::AnalogOut8,
@@ -338,6 +341,7 @@ impl Model {
             Model::MrDio42 => "metz-connect/mr-dio42",
             Model::MrTp => "metz-connect/mr-tp",
             Model::MrLd6 => "metz-connect/mr-ld6",
+            Model::MrAio42 => "metz-connect/mr-aio42",
             Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
             Model::AnalogOut8 => "fuehlersysteme/analog-out8",
@@ -366,6 +370,7 @@ impl Model {
             Model::MrDio42 => Box::new(MetzConnect::new(now, line, MrDio42::new(now))),
             Model::MrTp => Box::new(MetzConnect::new(now, line, MrTp::new(now))),
             Model::MrLd6 => Box::new(MetzConnect::new(now, line, MrLd6::new(now))),
+            Model::MrAio42 => Box::new(MetzConnect::new(now, line, MrAio42::new(now))),
             Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
             Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),

@@ -36,7 +36,7 @@ pub const COMMANDS: &str =
   unit N toggle T up|middle|down            a switch with three positions (MR-TP)
   unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
   unit N input I ohms X | volts X | celsius X | open
-                                            what is connected to an input (MR-AI8)
+                                            what is connected to an input (MR-AI8, MR-AIO4/2)
   unit N input I ohms X | volts X | open    a leak sensor, the voltage at its Zener diode (MR-LD6)
   unit N input I volts X | milliamps X | open
                                             what is connected to an input (MR-CI4, analog-in8)

@@ -8,6 +8,7 @@ pub(super) mod channel;
 mod contacts;
 pub(super) mod holding;
 pub mod mr_ai8;
+pub mod mr_aio42;
 pub mod mr_ao4;
 pub mod mr_ci4;
 pub mod mr_di;
@@ -300,6 +301,7 @@ mod tests {
             (Model::MrTp, metz_connect, "MR-TP", "V1.2"),
             (Model::MrLd6, metz_connect, "MR-LD6", "V1.1"),
             (Model::MrCi4, metz_connect, "MR-CI4", "V1.4"),
+            (Model::MrAio42, metz_connect, "MR-AIO4/2", "V1.4"),
             (Model::BtrMrAi8, "BTR", "MR-AI8", "V1.0"),
         ] {
             let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();

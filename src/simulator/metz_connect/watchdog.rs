@@ -1,4 +1,4 @@
-//! The watchdog of register 66, which all METZ CONNECT devices with outputs have (pages 8, 13, 24, 44, 46).
+//! The watchdog of register 66, which all METZ CONNECT devices with outputs have (pages 8, 13, 24, 44, 46, 61).
 
 use crate::engine::time::{Duration, Time};
 
