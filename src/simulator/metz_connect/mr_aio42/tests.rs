@@ -256,7 +256,7 @@ fn an_output_takes_the_register_that_switch_chooses_and_both_tell_it_pages_61_an
         (0, 0.0, "0.000 V"),
         (16_000, 50.0, "5.000 V"),
         (1, 0.003_125, "0.000 V"),
-        (32_767, 102.396_875, "10.240 V"),
+        (32_767, 102.396_87, "10.240 V"),
         (-1, 0.0, "0.000 V"),
     ] {
         let mut bench = bench();
@@ -617,6 +617,12 @@ fn all_of_a_controller_s_settings_reach_it_page_73() {
         write_word(&mut bench, side + MODE, 0x07);
         write(&mut bench, side + FP_XP, &[8.0]);
         assert_eq!(step(&mut bench, 4.0)[0], 5.0);
+        // Ymin and the dead range: 25 % is too near to 22 %, 27 % is not.
+        let mut bench = controlled();
+        write(&mut bench, side + Y_MIN, &[22.0, 100.0, 4.0]);
+        assert_eq!(step(&mut bench, 0.0)[3], 22.0);
+        assert_eq!(step(&mut bench, 1.5)[3], 22.0);
+        assert_eq!(step(&mut bench, 2.5)[3], 27.0);
     }
 }
 
@@ -689,6 +695,42 @@ fn an_inactive_controller_gives_deact_y_and_begins_anew_with_init_y_page_70() {
         bench.wait(ROUND);
         assert_eq!(bench.output(&output), "2.000 V");
     }
+}
+
+#[test]
+fn an_output_gives_no_more_than_it_can_of_what_a_controller_asks_page_61() {
+    let mut bench = controlled();
+    write_word(&mut bench, MODE, 0x21);
+    for (manual_y, percent, steps) in [(120.0, 102.4, 32_767), (-5.0, 0.0, 0), (102.0, 102.0, 32_640)] {
+        write(&mut bench, MANUAL_Y, &[manual_y]);
+        bench.wait(ROUND);
+        assert_eq!((read(&mut bench, OUT_F), read_word(&mut bench, 20)), (percent, steps));
+    }
+}
+
+#[test]
+fn a_controller_has_the_initial_set_point_from_the_moment_the_watchdog_expires_page_62() {
+    let prepared = || {
+        let mut bench = controlled();
+        write(&mut bench, TI, &[100.0]);
+        write(&mut bench, INIT_W, &[4.0]);
+        bench.act("input 1 volts 5").expect("a signal");
+        bench.check(&[("06 0042 00FA", "06 0042 00FA")]);
+        bench
+    };
+    // Looking at an output feeds nothing.
+    let (mut looked_at, mut left_alone) = (prepared(), prepared());
+    for _ in 0..200 {
+        looked_at.wait(100);
+        looked_at.output("output_1");
+    }
+    left_alone.wait(20_000);
+    assert_eq!(looked_at.output("output_1"), left_alone.output("output_1"));
+    // Yi begins with 20 - 10 %. Two steps with W = 0 add 0.1 % each, eighteen with W = 4 0.02 % each.
+    assert_eq!(left_alone.output("red_light"), "ON");
+    near(&mut left_alone, W, 4.0);
+    let told = read(&mut left_alone, YI);
+    assert!((told - 10.56).abs() < 0.001, "{told}");
 }
 
 #[test]
