@@ -19,6 +19,7 @@ use crate::simulator::metz_connect::mr_dio42::MrDio42;
 use crate::simulator::metz_connect::mr_do4::{MrDo4, MrDoa4};
 use crate::simulator::metz_connect::mr_ld6::MrLd6;
 use crate::simulator::metz_connect::mr_si4::MrSi4;
+use crate::simulator::metz_connect::mr_sm3::MrSm3;
 use crate::simulator::metz_connect::mr_to4::MrTo4;
 use crate::simulator::metz_connect::mr_tp::MrTp;
 
@@ -95,6 +96,8 @@ pub enum Stimulus {
     HandVolts { output: u8, volts: Option<f64> },
     /// What is connected to an input.
     Input { input: u8, signal: Signal },
+    /// What one of three phases carries; the other quantities stay.
+    Phase { phase: u8, quantity: PhaseQuantity, amount: f64 },
     /// One of the small switches behind the front.
     Dip { switch: u8, on: bool },
     /// Somebody presses the button at the device's front.
@@ -233,6 +236,16 @@ impl Signal {
             _ => None,
         }
     }
+/// What there is to a phase; voltage and current are root mean squares, angles are in degrees.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PhaseQuantity {
+    Volts,
+    Amps,
+    Hertz,
+    /// How far the current comes behind its voltage.
+    Lag,
+    /// How far the voltage comes before that of the first phase.
+    Angle,
 }
 
 /// A line's bit rate and parity.
@@ -295,6 +308,7 @@ pub enum Model {
     MrTp,
     MrLd6,
     MrAio42,
+    MrSm3,
     BtrMrAi8,
     Relay8,
     AnalogOut8,
@@ -304,6 +318,7 @@ pub enum Model {
 
 impl Model {
     pub const ALL: [Model; 19] = [
+    pub const ALL: [Model; 15] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,
@@ -318,6 +333,7 @@ impl Model {
         Model::MrTp,
         Model::MrLd6,
         Model::MrAio42,
+        Model::MrSm3,
         Model::BtrMrAi8,
         Model::Relay8,
         Model::AnalogOut8,
@@ -342,6 +358,7 @@ impl Model {
             Model::MrTp => "metz-connect/mr-tp",
             Model::MrLd6 => "metz-connect/mr-ld6",
             Model::MrAio42 => "metz-connect/mr-aio42",
+            Model::MrSm3 => "metz-connect/mr-sm3",
             Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
             Model::AnalogOut8 => "fuehlersysteme/analog-out8",
@@ -371,6 +388,7 @@ impl Model {
             Model::MrTp => Box::new(MetzConnect::new(now, line, MrTp::new(now))),
             Model::MrLd6 => Box::new(MetzConnect::new(now, line, MrLd6::new(now))),
             Model::MrAio42 => Box::new(MetzConnect::new(now, line, MrAio42::new(now))),
+            Model::MrSm3 => Box::new(MetzConnect::new(now, line, MrSm3::new(now))),
             Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
             Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),
@@ -470,7 +488,7 @@ mod tests {
 
     /// A request that is likely to be understood, or any bytes at all.
     fn pdu() -> impl Strategy<Value = Vec<u8>> {
-        let small = || prop_oneof![0u16..110, 0u16..700, any::<u16>()];
+        let small = || prop_oneof![0u16..130, 0u16..900, any::<u16>()];
         let words = (small(), vec(any::<u16>(), 0..12)).prop_map(|(first, words)| {
             let mut pdu = vec![16];
             pdu.extend(first.to_be_bytes());
@@ -507,6 +525,16 @@ mod tests {
                 .prop_map(|(toggle, position)| Stimulus::Toggle { toggle, position }),
             (0..6u8, 0.0..12.0f64)
                 .prop_map(|(output, volts)| Stimulus::HandVolts { output, volts: Some(volts) }),
+            (0..5u8, 0..5usize, -200.0..1200.0f64).prop_map(|(phase, quantity, amount)| {
+                let quantity = [
+                    PhaseQuantity::Volts,
+                    PhaseQuantity::Amps,
+                    PhaseQuantity::Hertz,
+                    PhaseQuantity::Lag,
+                    PhaseQuantity::Angle,
+                ][quantity];
+                Stimulus::Phase { phase, quantity, amount }
+            }),
             (0..10u8, any::<bool>()).prop_map(|(switch, on)| Stimulus::Dip { switch, on }),
             (0..10u8, signal).prop_map(|(input, signal)| Stimulus::Input { input, signal }),
         ]

@@ -10,6 +10,7 @@
 use crate::engine::address::{Span, Table};
 use crate::engine::time::Duration;
 use crate::simulator::device::{Hand, Quantity, Signal, Stimulus, Toggle, parse_unit};
+use crate::simulator::device::{Hand, PhaseQuantity, Signal, Stimulus};
 use crate::simulator::fault::Fault;
 
 /// What a line of a script does.
@@ -44,6 +45,9 @@ pub const COMMANDS: &str =
                                             analog-in8)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
+  unit N phase P volts X | amps X | hertz X | lag X | angle X
+                                            a phase: its current lags its voltage by degrees, which is
+                                            at an angle to that of phase 1 (MR-SM3)
   unit N dip D on|off                       a DIP switch (MR-CI4)
   unit N button                             somebody presses the button (MR-SI4)
   unit N measure QUANTITY X                 what is around a sensor (sensor): humidity, temperature, co2,
@@ -133,6 +137,11 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
         ["dip", switch, state @ ("on" | "off")] => {
             Stimulus::Dip { switch: parse_number("switch", switch)?, on: *state == "on" }
         }
+        ["phase", phase, quantity, amount] => Stimulus::Phase {
+            phase: parse_number("phase", phase)?,
+            quantity: parse_quantity(quantity)?,
+            amount: parse_finite(amount)?,
+        },
         ["output", output, "hand", setting] => {
             let volts = if *setting == "automatic" { None } else { Some(parse_finite(setting)?) };
             Stimulus::HandVolts { output: parse_number("output", output)?, volts }
@@ -197,6 +206,19 @@ fn parse_signal(words: &[&str]) -> Result<Signal, String> {
             Ok(Signal::Pulses { count: parse_number("count", number)?, every: parse_duration(period)? })
         }
         _ => Err(format!("`{}` is not a signal; there are\n{COMMANDS}", words.join(" "))),
+    }
+}
+
+fn parse_quantity(text: &str) -> Result<PhaseQuantity, String> {
+    match text {
+        "volts" => Ok(PhaseQuantity::Volts),
+        "amps" => Ok(PhaseQuantity::Amps),
+        "hertz" => Ok(PhaseQuantity::Hertz),
+        "lag" => Ok(PhaseQuantity::Lag),
+        "angle" => Ok(PhaseQuantity::Angle),
+        _ => Err(format!(
+            "`{text}` is nothing of a phase; there are `volts`, `amps`, `hertz`, `lag` and `angle`"
+        )),
     }
 }
 
@@ -284,6 +306,10 @@ mod tests {
             ("unit 5 set 'input 0' 215", 0, stimulate(5, set(Table::Input, 0, &[215]))),
             ("unit 5 set holding 9 -5 0x00FF", 0, stimulate(5, set(Table::Holding, 9, &[65531, 255]))),
             ("unit 5 motion", 0, stimulate(5, Stimulus::Motion)),
+                "unit 22 phase 2 angle -120",
+                0,
+                stimulate(22, Stimulus::Phase { phase: 2, quantity: PhaseQuantity::Angle, amount: -120.0 }),
+            ),
             ("unit 18 restart", 0, Action::Restart { unit: 18 }),
             (
                 "unit 18 fault late=700ms,every=2",

@@ -16,6 +16,7 @@ pub mod mr_dio42;
 pub mod mr_do4;
 pub mod mr_ld6;
 pub mod mr_si4;
+pub mod mr_sm3;
 pub mod mr_to4;
 pub mod mr_tp;
 mod sensors;
@@ -39,6 +40,8 @@ pub trait Module: Send {
     const LINE_FUNCTIONS: &'static [u8] = &[6, 16];
     /// Whether register 65 can be read, too. [`Module::serve`] then has any word there.
     const READS_LINE: bool = false;
+    /// Whether register 65 can be read, too: only some chapters have it in their lists of function 3.
+    const LINE_IS_READ: bool = false;
 
     /// Answers a request with one of `FUNCTIONS`, for anything but register 65.
     fn serve(&mut self, now: Time, request: &Request) -> Result<Vec<u8>, Exception>;
@@ -121,6 +124,7 @@ impl<M: Module> MetzConnect<M> {
             _ => {
                 let mut reply = self.module.serve(now, &request)?;
                 if M::READS_LINE {
+                if M::LINE_IS_READ {
                     self.tell_line(&request, &mut reply);
                 }
                 Ok(Some(reply))
@@ -142,6 +146,20 @@ impl<M: Module> MetzConnect<M> {
     fn line_code(&self) -> u16 {
         let parity = PARITIES.iter().position(|parity| *parity == self.line.parity).map_or(0, |at| at + 1);
         // A bit rate that register 65 has no code for is the line's own: 0, "not set".
+    /// Puts register 65 where it belongs among the module's own, which knows nothing of it.
+    fn tell_line(&self, request: &Request, reply: &mut [u8]) {
+        let Request::Read { function: 3 | 4, first, .. } = request else { return };
+        let at = LINE_REGISTER.checked_sub(*first).map(|number| 2 + 2 * usize::from(number));
+        if let Some(word) = at.and_then(|at| reply.get_mut(at..at + 2)) {
+            word.copy_from_slice(&self.line_codes().to_be_bytes());
+        }
+    }
+
+    /// The codes of register 65. The magic number is of the request that changes them; what its byte
+    /// reads as is not told.
+    fn line_codes(&self) -> u16 {
+        let parity = PARITIES.iter().position(|parity| *parity == self.line.parity).map_or(0, |at| at + 1);
+        // A bit rate that register 65 has no code for is the line's own: stored as 0, "not set".
         let baud = BAUD_RATES.iter().position(|baud| *baud == self.line.baud).map_or(0, |at| at + 1);
         (parity << 4 | baud) as u16
     }
@@ -260,6 +278,7 @@ impl<M: Module> SimulatedDevice for MetzConnect<M> {
 
     fn eeprom(&self) -> Vec<u16> {
         let mut words = vec![self.line_code()];
+        let mut words = vec![self.line_codes()];
         words.extend(self.module.eeprom());
         words
     }
@@ -302,6 +321,7 @@ mod tests {
             (Model::MrLd6, metz_connect, "MR-LD6", "V1.1"),
             (Model::MrCi4, metz_connect, "MR-CI4", "V1.4"),
             (Model::MrAio42, metz_connect, "MR-AIO4/2", "V1.4"),
+            (Model::MrSm3, metz_connect, "MR-SM3", "V1.2"),
             (Model::BtrMrAi8, "BTR", "MR-AI8", "V1.0"),
         ] {
             let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();
