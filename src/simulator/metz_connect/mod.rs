@@ -19,6 +19,7 @@ pub mod mr_si4;
 pub mod mr_sm3;
 pub mod mr_to4;
 pub mod mr_tp;
+mod pulse_input;
 mod sensors;
 mod switches;
 mod watchdog;

@@ -1,71 +1,18 @@
 //! MR-SI4: four pulse inputs with 48-bit counters and calculated meter readings (Softwarebeschreibung
 //! Modbus RTU V2.1, pages 16 to 20).
 
-use crate::engine::time::{Duration, Time};
-use crate::simulator::device::{Signal, Stimulus, take_words};
+use crate::engine::time::Time;
+use crate::simulator::device::{Stimulus, take_words};
 use crate::simulator::metz_connect::Module;
+use crate::simulator::metz_connect::pulse_input::PulseInput;
 use crate::simulator::pdu::{Exception, Request, bits_reply, check_span, words_reply, write_reply};
 
 /// The four inputs and the button.
 pub struct MrSi4 {
-    inputs: [Input; INPUTS],
+    inputs: [PulseInput; INPUTS],
 }
 
-/// One input with its counter and its settings. All of it outlives a restart: the table marks the
-/// holding registers as EEPROM, and of the pulse counter the manual wants that it behaves exactly
-/// like the meter behind it, which forgets nothing either.
-#[derive(Clone, Copy, Debug)]
-struct Input {
-    /// IZ, 48 bits.
-    pulses: u64,
-    /// IT: the counter at the press of the button, 48 bits.
-    at_button: u64,
-    /// AZ.
-    initial: u32,
-    /// IE.
-    pulses_per_unit: u16,
-    /// WI and WU.
-    current_factor: u16,
-    voltage_factor: u16,
-    /// WP: false is formula 0, true is formula 1.
-    factors_only_pulses: bool,
-    /// ZS, high and low byte.
-    digits: u8,
-    decimals: u8,
-    /// TA.
-    button_enabled: bool,
-    contact: Contact,
-}
-
-/// What is connected to an input.
-#[derive(Clone, Copy, Debug)]
-struct Contact {
-    closed: bool,
-    /// When the closing of a pulse ends.
-    opens_at: Option<Time>,
-    last_counted: Option<Time>,
-    /// Closings still to come, from this one on.
-    next_pulse: Time,
-    remaining: u64,
-    every: Duration,
-}
-
-const OPEN: Contact = Contact {
-    closed: false,
-    opens_at: None,
-    last_counted: None,
-    next_pulse: Time(0),
-    remaining: 0,
-    every: PULSE_DISTANCE,
-};
 const INPUTS: usize = 4;
-/// "Alle 60 Millisekunden kann ein Impuls vom Stromzähler kommen": what comes faster is not counted.
-const PULSE_DISTANCE: Duration = Duration::from_millis(60);
-/// How long a simulated pulse keeps the contact closed, as the S0 interface asks for.
-const PULSE_LENGTH: Duration = Duration::from_millis(30);
-const COUNTER_MASK: u64 = 0xFFFF_FFFF_FFFF;
-const DIGITS_MAX: u8 = 9;
-const DECIMALS_MAX: u8 = 3;
 /// The first register of each block, and how many registers a value of it has.
 const HOLDING_BLOCKS: [(u16, u16); 8] =
     [(0, 3), (12, 2), (20, 1), (24, 1), (28, 1), (32, 1), (36, 1), (40, 1)];
@@ -76,40 +23,27 @@ const INPUT_LAST: u16 = 20;
 const EEPROM_WORDS: usize = 14;
 
 impl MrSi4 {
-    pub fn new(_now: Time) -> MrSi4 {
-        let input = Input {
-            pulses: 0,
-            at_button: 0,
-            initial: 0,
-            pulses_per_unit: 1,
-            current_factor: 1,
-            voltage_factor: 1,
-            factors_only_pulses: false,
-            digits: 7,
-            decimals: 1,
-            button_enabled: true,
-            contact: OPEN,
-        };
-        MrSi4 { inputs: [input; INPUTS] }
+    pub fn new(now: Time) -> MrSi4 {
+        MrSi4 { inputs: [PulseInput::new(now); INPUTS] }
     }
 
     fn input_registers(&self) -> Vec<u16> {
         let counters = self.inputs.iter().flat_map(|input| words48(input.pulses));
         let readings = self.inputs.iter().flat_map(|input| words32(input.meter_reading()));
         let states = self.inputs.iter().enumerate();
-        let states = states.map(|(number, input)| u16::from(input.contact.closed) << number).sum();
+        let states = states.map(|(number, input)| u16::from(input.is_closed()) << number).sum();
         counters.chain(readings).chain([states]).collect()
     }
 
     fn holding_registers(&self) -> Vec<u16> {
-        let each = |word: fn(&Input) -> u16| self.inputs.iter().map(word).collect::<Vec<u16>>();
+        let each = |word: fn(&PulseInput) -> u16| self.inputs.iter().map(word).collect::<Vec<u16>>();
         let mut words: Vec<u16> = self.inputs.iter().flat_map(|input| words48(input.at_button)).collect();
         words.extend(self.inputs.iter().flat_map(|input| words32(input.initial)));
         words.extend(each(|input| input.pulses_per_unit));
         words.extend(each(|input| input.current_factor));
         words.extend(each(|input| input.voltage_factor));
         words.extend(each(|input| input.factors_only_pulses.into()));
-        words.extend(each(|input| u16::from_be_bytes([input.digits, input.decimals])));
+        words.extend(each(PulseInput::format));
         words.extend(each(|input| input.button_enabled.into()));
         words
     }
@@ -130,51 +64,8 @@ impl MrSi4 {
             input.voltage_factor = single(2);
             // "nur Bit 0 gilt", of WP and of TA.
             input.factors_only_pulses = single(3) & 1 == 1;
-            let [digits, decimals] = single(4).to_be_bytes();
-            // "größere Werte werden auf 9 begrenzt", "auf 3 begrenzt".
-            input.digits = digits.min(DIGITS_MAX);
-            input.decimals = decimals.min(DECIMALS_MAX);
+            input.set_format(single(4));
             input.button_enabled = single(5) & 1 == 1;
-        }
-    }
-}
-
-impl Input {
-    /// BZ, by the manual's "Details zur Berechnung": everything in a wide integer, the division by IE
-    /// behind all multiplications, the digits cut off last.
-    fn meter_reading(&self) -> u32 {
-        let factors = u128::from(self.current_factor) * u128::from(self.voltage_factor);
-        // IZ and IT are uint48_t, and so is their difference before it is made wider.
-        let counted = u128::from(self.pulses.wrapping_sub(self.at_button) & COUNTER_MASK);
-        let power = |exponent: u8| 10u128.pow(exponent.into());
-        let scaled = counted * factors * power(self.decimals);
-        // The manual allows every IE and does not say what 0 gives: here the pulses then count nothing.
-        let counted = scaled.checked_div(u128::from(self.pulses_per_unit)).unwrap_or(0);
-        let initial = u128::from(self.initial) * if self.factors_only_pulses { 1 } else { factors };
-        ((counted + initial) % power(self.digits)) as u32
-    }
-
-    fn advance(&mut self, now: Time) {
-        while self.contact.remaining > 0 && self.contact.next_pulse <= now {
-            let at = self.contact.next_pulse;
-            self.close(at);
-            let contact = &mut self.contact;
-            contact.remaining -= 1;
-            contact.next_pulse = at + contact.every;
-            contact.opens_at = Some(at + PULSE_LENGTH.min(contact.every / 2));
-        }
-        if self.contact.opens_at.is_some_and(|opens_at| opens_at <= now) {
-            self.contact.closed = false;
-            self.contact.opens_at = None;
-        }
-    }
-
-    /// The contact closes: that is what is counted.
-    fn close(&mut self, now: Time) {
-        self.contact.closed = true;
-        if self.contact.last_counted.is_none_or(|last| now.since(last) >= PULSE_DISTANCE) {
-            self.pulses = self.pulses.wrapping_add(1) & COUNTER_MASK;
-            self.contact.last_counted = Some(now);
         }
     }
 }
@@ -207,7 +98,7 @@ impl Module for MrSi4 {
             Request::Read { function: 2, first, count } => {
                 check_span(first, count.into(), INPUTS, (0, 3))?;
                 let inputs = &self.inputs[usize::from(first)..usize::from(first + count)];
-                let states: Vec<bool> = inputs.iter().map(|input| input.contact.closed).collect();
+                let states: Vec<bool> = inputs.iter().map(PulseInput::is_closed).collect();
                 Ok(bits_reply(2, &states))
             }
             Request::Read { function, first, count } => {
@@ -243,51 +134,17 @@ impl Module for MrSi4 {
     }
 
     fn restart(&mut self, now: Time) {
-        // A meter goes on pulsing while the device starts; what came without power is not counted.
-        for input in &mut self.inputs {
-            while input.contact.remaining > 0 && input.contact.next_pulse <= now {
-                input.contact.remaining -= 1;
-                input.contact.next_pulse += input.contact.every;
-            }
-            input.contact.last_counted = None;
-        }
+        self.inputs.iter_mut().for_each(|input| input.restart(now));
     }
 
     fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String> {
         match *stimulus {
             Stimulus::Button => {
-                for input in self.inputs.iter_mut().filter(|input| input.button_enabled) {
-                    input.at_button = input.pulses;
-                }
+                self.inputs.iter_mut().for_each(PulseInput::press_button);
                 Ok(())
             }
             Stimulus::Input { input: number @ 1..=4, signal } => {
-                let input = &mut self.inputs[usize::from(number) - 1];
-                match signal {
-                    Signal::Open | Signal::Contact(false) => {
-                        input.contact = Contact { last_counted: input.contact.last_counted, ..OPEN };
-                    }
-                    Signal::Contact(true) => {
-                        if !input.contact.closed {
-                            input.close(now);
-                        }
-                        input.contact.remaining = 0;
-                        input.contact.opens_at = None;
-                    }
-                    Signal::Pulses { count, every } if !every.is_zero() => {
-                        input.contact.remaining = count;
-                        input.contact.every = every;
-                        input.contact.next_pulse = now;
-                        input.advance(now);
-                    }
-                    Signal::Counter(count) if count <= COUNTER_MASK => input.pulses = count,
-                    Signal::Pulses { .. } => {
-                        return Err("pulses need a distance, such as `every 80ms`".into());
-                    }
-                    Signal::Counter(_) => return Err(format!("a counter ends at {COUNTER_MASK}")),
-                    _ => return Err("an input of MR-SI4 takes a contact, pulses or a counter".into()),
-                }
-                Ok(())
+                self.inputs[usize::from(number) - 1].connect(now, signal, Self::PRODUCT)
             }
             Stimulus::Input { input, .. } => Err(format!("input {input} is not there; MR-SI4 has 1 to 4")),
             _ => Err("MR-SI4 has inputs and a button, no relays".into()),
