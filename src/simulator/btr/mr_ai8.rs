@@ -5,7 +5,7 @@ use crate::engine::time::Time;
 use crate::simulator::device::Stimulus;
 use crate::simulator::metz_connect::Module;
 use crate::simulator::metz_connect::analog_inputs::{AnalogInputs, REGISTERS};
-use crate::simulator::metz_connect::channel::Code;
+use crate::simulator::metz_connect::channel::is_code_without_carel;
 use crate::simulator::metz_connect::holding::HoldingRegisters;
 use crate::simulator::pdu::{Exception, Request, check_span};
 
@@ -23,12 +23,6 @@ impl MrAi8 {
     }
 }
 
-/// METZ CONNECT's codes without their bit 8 (here "15-8: reserviert") and without sensor 13 (here
-/// "13-55: reserviert").
-fn is_code(word: u16) -> bool {
-    word <= 0xFF && word & 0xFE != 0x9A && Code::parse(word).is_some()
-}
-
 impl HoldingRegisters for MrAi8 {
     fn check(first: u16, count: usize) -> Result<(), Exception> {
         check_span(first, count, REGISTERS_MAX, REGISTERS)
@@ -39,7 +33,8 @@ impl HoldingRegisters for MrAi8 {
     }
 
     fn write(&mut self, now: Time, first: u16, words: &[u16]) -> Result<(), Exception> {
-        self.inputs.check_codes(first, words, is_code)?;
+        // Bit 8 ("15-8: reserviert") and sensor 13 ("13-55: reserviert") are not there.
+        self.inputs.check_codes(first, words, is_code_without_carel)?;
         for (register, word) in (first..).zip(words) {
             self.inputs.write(now, register, *word);
         }

@@ -1,9 +1,10 @@
 //! Inputs for voltage, resistance and temperature: what the chapters MR-AI8 of METZ CONNECT (pages 48
-//! to 57) and of BTR (section 10.1) agree on, and MR-AIO4/2 (pages 62 to 69) with half as many.
+//! to 57) and of BTR (section 10.1) agree on, MR-AIO4/2 (pages 62 to 69) with half as many, and MR-Multi
+//! I/O (pages 91 to 95) with one of seven for current.
 
 use crate::engine::time::{Duration, Time};
 use crate::simulator::device::{Signal, Stimulus, take_words};
-use crate::simulator::metz_connect::channel::{Code, Format, float, measure, quantity, raw_words};
+use crate::simulator::metz_connect::channel::{Code, Format, VOLTS_MAX, float, measure, quantity, raw_words};
 use crate::simulator::pdu::{Exception, check_span, words_reply};
 
 /// `N` inputs, with the registers from 0 to 63 that are about them.
@@ -15,6 +16,10 @@ pub struct AnalogInputs<const N: usize = INPUTS> {
     /// Registers 24 to 63: temperature and resistance of ten points, each a float. EEPROM.
     table: [u16; TABLE_WORDS],
     inputs: [Input; N],
+    /// As far as voltages are measured.
+    volts_max: f64,
+    /// The input that measures current, counted from 0, where one does.
+    current_input: Option<usize>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -42,7 +47,19 @@ impl<const N: usize> AnalogInputs<N> {
     pub fn new(now: Time) -> AnalogInputs<N> {
         let ready_at = now + FIRST_MEASUREMENT;
         let input = Input { signal: Signal::Open, ready_at, words: [0; 2], quantity: 0.0 };
-        AnalogInputs { offsets: [[0; 2]; N], codes: [0; N], table: [0; TABLE_WORDS], inputs: [input; N] }
+        AnalogInputs {
+            offsets: [[0; 2]; N],
+            codes: [0; N],
+            table: [0; TABLE_WORDS],
+            inputs: [input; N],
+            volts_max: VOLTS_MAX,
+            current_input: None,
+        }
+    }
+
+    /// The same, of a device that measures voltages up to `volts_max`, and a current at one input.
+    pub fn reaching(self, volts_max: f64, current_input: usize) -> AnalogInputs<N> {
+        AnalogInputs { volts_max, current_input: Some(current_input), ..self }
     }
 
     /// One of the registers of offsets, codes and table.
@@ -83,7 +100,7 @@ impl<const N: usize> AnalogInputs<N> {
     pub fn measure_one(&mut self, number: usize, fahrenheit: bool) {
         let (code, offset) = (self.code(number), self.offsets[number]);
         let input = &mut self.inputs[number];
-        let value = measure(code, input.signal, &self.table, fahrenheit);
+        let value = measure(code, input.signal, &self.table, fahrenheit, self.volts_max);
         input.words = raw_words(code, value, offset);
         input.quantity = quantity(code, value, offset, fahrenheit);
     }
@@ -102,8 +119,13 @@ impl<const N: usize> AnalogInputs<N> {
 
     /// What the code register says.
     pub fn code(&self, number: usize) -> Code {
+        let parse = if self.measures_current(number) { Code::parse_current } else { Code::parse };
         // Only allowed codes are ever written.
-        Code::parse(self.codes[number]).unwrap_or_default()
+        parse(self.codes[number]).unwrap_or_default()
+    }
+
+    fn measures_current(&self, number: usize) -> bool {
+        self.current_input == Some(number)
     }
 
     /// The two registers of the measured value.
@@ -128,10 +150,16 @@ impl<const N: usize> AnalogInputs<N> {
     pub fn stimulate(&mut self, device: &str, stimulus: &Stimulus) -> Result<(), String> {
         match *stimulus {
             Stimulus::Input { input, signal } if (1..=N).contains(&input.into()) => {
-                if !matches!(signal, Signal::Open | Signal::Ohms(_) | Signal::Volts(_) | Signal::Celsius(_)) {
-                    return Err(format!("an input of {device} takes ohms, volts, celsius or open"));
+                let number = usize::from(input) - 1;
+                match (self.measures_current(number), signal) {
+                    (_, Signal::Open)
+                    | (false, Signal::Ohms(_) | Signal::Volts(_) | Signal::Celsius(_))
+                    | (true, Signal::Milliamps(_)) => self.inputs[number].signal = signal,
+                    (false, _) => {
+                        return Err(format!("an input of {device} takes ohms, volts, celsius or open"));
+                    }
+                    (true, _) => return Err(format!("input {input} of {device} takes milliamps or open")),
                 }
-                self.inputs[usize::from(input) - 1].signal = signal;
                 Ok(())
             }
             Stimulus::Input { input, .. } => {

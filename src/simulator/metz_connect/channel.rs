@@ -16,7 +16,7 @@ pub struct Code {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Format {
     Float,
-    /// In the first register, `per_unit` steps to one volt, ohm or degree; the second holds 0.
+    /// In the first register, `per_unit` steps to one volt, ohm, degree or milliampere; the second holds 0.
     Integer {
         per_unit: f64,
     },
@@ -38,14 +38,20 @@ enum Circuit {
     /// 0 to 10 V with 2 kΩ to 5 V.
     Pullup,
     Resistance,
+    /// 0 to 20 mA, of MR-Multi I/O's input I (page 93).
+    Current,
 }
 
 /// "Spannung 0-10 V, Maximum 10,24 V" (page 54).
-const VOLTS_MAX: f64 = 10.24;
+pub const VOLTS_MAX: f64 = 10.24;
 /// "Widerstand, Maximum 4 MΩ" (page 54); an input without anything connected reads it.
 const OHMS_MAX: f64 = 4e6;
+/// "Strom 0-20mA, Maximum 22 mA" (page 93).
+const MILLIAMPS_MAX: f64 = 22.0;
 /// Steps of the integer to one volt: "1 V / 3200" (page 51).
 const VOLT_STEPS: f64 = 3200.0;
+/// Steps of the integer to one milliampere: "1mA / 1600" (page 93).
+const MILLIAMP_STEPS: f64 = 1600.0;
 
 impl Default for Code {
     /// 0, "Werkseinstellung": voltage as a float.
@@ -82,6 +88,22 @@ impl Code {
         };
         Some(Code { format, meaning })
     }
+
+    /// Reads the register of an input that measures current: only 0 and 1, which mean volts elsewhere.
+    pub fn parse_current(word: u16) -> Option<Code> {
+        let format = match word {
+            0 => Format::Float,
+            1 => Format::Integer { per_unit: MILLIAMP_STEPS },
+            _ => return None,
+        };
+        Some(Code { format, meaning: Meaning::Electric(Circuit::Current) })
+    }
+}
+
+/// The codes of devices that compare with no threshold, for which bit 8 stands, and do not have sensor
+/// 13, NTC-10k of CAREL: BTR's MR-AI8 and MR-Multi I/O.
+pub fn is_code_without_carel(word: u16) -> bool {
+    word <= 0xFF && word & 0xFE != 0x9A && Code::parse(word).is_some()
 }
 
 impl Circuit {
@@ -94,36 +116,39 @@ impl Circuit {
         }
     }
 
-    /// Volts or ohms at the terminals. A temperature without a sensor is nothing to measure.
-    fn measure(self, signal: Signal) -> f64 {
+    /// Volts, ohms or milliamperes at the terminals. A temperature without a sensor is nothing to measure.
+    fn measure(self, signal: Signal, volts_max: f64) -> f64 {
         match (self, signal) {
-            (Circuit::Voltage | Circuit::Pullup, Signal::Volts(volts)) => volts.clamp(0.0, VOLTS_MAX),
+            (Circuit::Voltage | Circuit::Pullup, Signal::Volts(volts)) => volts.clamp(0.0, volts_max),
             (Circuit::Pullup, Signal::Ohms(ohms)) => 5.0 * ohms.max(0.0) / (ohms.max(0.0) + 2000.0),
             (Circuit::Pullup, _) => 5.0,
             (Circuit::Voltage, _) => 0.0,
             (Circuit::Resistance, Signal::Ohms(ohms)) => ohms.clamp(0.0, OHMS_MAX),
             (Circuit::Resistance, Signal::Volts(_)) => 0.0,
             (Circuit::Resistance, _) => OHMS_MAX,
+            (Circuit::Current, Signal::Milliamps(milliamps)) => milliamps.clamp(0.0, MILLIAMPS_MAX),
+            (Circuit::Current, _) => 0.0,
         }
     }
 }
 
-/// The value of an input in its unit: volts, ohms, degrees, or what the table's left column holds.
-pub fn measure(code: Code, signal: Signal, table: &[u16], fahrenheit: bool) -> f64 {
+/// The value of an input in its unit: volts, ohms, milliamperes, degrees, or what the table's left column
+/// holds. `volts_max` is as far as the device measures.
+pub fn measure(code: Code, signal: Signal, table: &[u16], fahrenheit: bool, volts_max: f64) -> f64 {
     match code.meaning {
-        Meaning::Electric(circuit) => circuit.measure(signal),
+        Meaning::Electric(circuit) => circuit.measure(signal, volts_max),
         Meaning::Sensor(sensor) => {
             let celsius = match (signal, sensor.quantity()) {
                 (Signal::Celsius(celsius), _) => sensor.limit(celsius),
-                (signal, Quantity::Ohms) => sensor.celsius(Circuit::Resistance.measure(signal)),
-                (signal, Quantity::Volts) => sensor.celsius(Circuit::Pullup.measure(signal)),
+                (signal, Quantity::Ohms) => sensor.celsius(Circuit::Resistance.measure(signal, volts_max)),
+                (signal, Quantity::Volts) => sensor.celsius(Circuit::Pullup.measure(signal, volts_max)),
             };
             // "gilt für alle aufgelisteten Sensortypen, aber nicht für die Interpolations-Tabelle".
             if fahrenheit { celsius * 1.8 + 32.0 } else { celsius }
         }
         Meaning::Table { circuit, exponential } => match signal {
             Signal::Celsius(celsius) => celsius,
-            signal => interpolate(&table_points(table), circuit.measure(signal), exponential),
+            signal => interpolate(&table_points(table), circuit.measure(signal, volts_max), exponential),
         },
     }
 }
@@ -238,7 +263,7 @@ mod tests {
             (129, Signal::Celsius(500.0), 1500),
         ] {
             let code = Code::parse(code).expect("a code");
-            let words = raw_words(code, measure(code, signal, &[], false), [0, 0]);
+            let words = raw_words(code, measure(code, signal, &[], false, VOLTS_MAX), [0, 0]);
             assert_eq!(words, [word as u16, 0], "{code:?} {signal:?}");
         }
     }
