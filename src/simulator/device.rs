@@ -18,6 +18,7 @@ use crate::simulator::metz_connect::mr_di::{MrDi4, MrDi10};
 use crate::simulator::metz_connect::mr_dio42::MrDio42;
 use crate::simulator::metz_connect::mr_do4::{MrDo4, MrDoa4};
 use crate::simulator::metz_connect::mr_ld6::MrLd6;
+use crate::simulator::metz_connect::mr_multi_io::MrMultiIo;
 use crate::simulator::metz_connect::mr_si4::MrSi4;
 use crate::simulator::metz_connect::mr_sm3::MrSm3;
 use crate::simulator::metz_connect::mr_to4::MrTo4;
@@ -309,6 +310,7 @@ pub enum Model {
     MrLd6,
     MrAio42,
     MrSm3,
+    MrMultiIo,
     BtrMrAi8,
     Relay8,
     AnalogOut8,
@@ -319,6 +321,7 @@ pub enum Model {
 impl Model {
     pub const ALL: [Model; 19] = [
     pub const ALL: [Model; 15] = [
+    pub const ALL: [Model; 16] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,
@@ -334,6 +337,7 @@ impl Model {
         Model::MrLd6,
         Model::MrAio42,
         Model::MrSm3,
+        Model::MrMultiIo,
         Model::BtrMrAi8,
         Model::Relay8,
         Model::AnalogOut8,
@@ -359,6 +363,7 @@ impl Model {
             Model::MrLd6 => "metz-connect/mr-ld6",
             Model::MrAio42 => "metz-connect/mr-aio42",
             Model::MrSm3 => "metz-connect/mr-sm3",
+            Model::MrMultiIo => "metz-connect/mr-multi-io",
             Model::BtrMrAi8 => "btr/mr-ai8",
             Model::Relay8 => "fuehlersysteme/relay8",
             Model::AnalogOut8 => "fuehlersysteme/analog-out8",
@@ -389,6 +394,7 @@ impl Model {
             Model::MrLd6 => Box::new(MetzConnect::new(now, line, MrLd6::new(now))),
             Model::MrAio42 => Box::new(MetzConnect::new(now, line, MrAio42::new(now))),
             Model::MrSm3 => Box::new(MetzConnect::new(now, line, MrSm3::new(now))),
+            Model::MrMultiIo => Box::new(MetzConnect::new(now, line, MrMultiIo::new(now))),
             Model::BtrMrAi8 => Box::new(MetzConnect::new(now, line, btr::mr_ai8::MrAi8::new(now))),
             Model::Relay8 => Box::new(Relay8::new(now)),
             Model::AnalogOut8 => Box::new(AnalogOut8::new(now)),
@@ -536,7 +542,7 @@ mod tests {
                 Stimulus::Phase { phase, quantity, amount }
             }),
             (0..10u8, any::<bool>()).prop_map(|(switch, on)| Stimulus::Dip { switch, on }),
-            (0..10u8, signal).prop_map(|(input, signal)| Stimulus::Input { input, signal }),
+            (0..14u8, signal).prop_map(|(input, signal)| Stimulus::Input { input, signal }),
         ]
     }
 

@@ -33,6 +33,7 @@ pub struct Step {
 /// The commands, as the help shows them.
 pub const COMMANDS: &str =
     "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4, MR-DIO4/2)
+    "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4, MR-Multi I/O)
   unit N triac T hand on|off|automatic      a triac's hand switch (MR-TO4)
   unit N toggle T up|middle|down            a switch with three positions (MR-TP)
   unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
@@ -45,6 +46,14 @@ pub const COMMANDS: &str =
                                             analog-in8)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4)
+                                            what is connected to an input (MR-AI8, MR-Multi I/O)
+  unit N input I volts X | milliamps X | open
+                                            what is connected to an input (MR-CI4, analog-in8;
+                                            MR-Multi I/O: 7 is I)
+  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, analog-in8,
+                                            MR-Multi I/O: 12 is S0)
+  unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4, MR-Multi I/O: 12)
+  unit N input I counter COUNT              sets a pulse counter (MR-SI4, MR-Multi I/O: 12)
   unit N phase P volts X | amps X | hertz X | lag X | angle X
                                             a phase: its current lags its voltage by degrees, which is
                                             at an angle to that of phase 1 (MR-SM3)
@@ -55,6 +64,7 @@ pub const COMMANDS: &str =
                                             light, flow; door, window, switch with `open` or `closed`
   unit N motion                             somebody moves (sensor)
   unit N set 'TABLE ADDRESS' WORD …         raw words from there on, as in `set 'input 0' 215` (--profile)
+  unit N button                             somebody presses the button (MR-SI4, MR-Multi I/O)
   unit N power off|on                       power loss: only the EEPROM is kept
   unit N restart                            the same, and silent for two seconds
   unit N fault KIND | none                  see --fault

@@ -15,6 +15,7 @@ pub mod mr_di;
 pub mod mr_dio42;
 pub mod mr_do4;
 pub mod mr_ld6;
+pub mod mr_multi_io;
 pub mod mr_si4;
 pub mod mr_sm3;
 pub mod mr_to4;
@@ -323,6 +324,7 @@ mod tests {
             (Model::MrCi4, metz_connect, "MR-CI4", "V1.4"),
             (Model::MrAio42, metz_connect, "MR-AIO4/2", "V1.4"),
             (Model::MrSm3, metz_connect, "MR-SM3", "V1.2"),
+            (Model::MrMultiIo, metz_connect, "MR-Multi IO", "V1.2"),
             (Model::BtrMrAi8, "BTR", "MR-AI8", "V1.0"),
         ] {
             let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();
