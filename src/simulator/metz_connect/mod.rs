@@ -30,6 +30,7 @@ use crate::simulator::device::{
     Addressed, LineSettings, Overheard, Parity, SimulatedDevice, Stimulus, check_eeprom_length,
 };
 use crate::simulator::pdu::{Exception, Request, exception_reply, identification_reply, write_reply};
+use crate::simulator::pdu::{Exception, Request, exception_reply, words_reply, write_reply};
 
 /// The chapter of one device: its registers, its process side, its EEPROM.
 pub trait Module: Send {
@@ -154,6 +155,10 @@ impl<M: Module> MetzConnect<M> {
         let at = LINE_REGISTER.checked_sub(*first).map(|number| 2 + 2 * usize::from(number));
         if let Some(word) = at.and_then(|at| reply.get_mut(at..at + 2)) {
             word.copy_from_slice(&self.line_codes().to_be_bytes());
+            Request::Read { function: 3, first: LINE_REGISTER, count: 1 } if M::LINE_IS_READ => {
+                Ok(Some(words_reply(3, &[self.line_codes()])))
+            }
+            _ => self.module.serve(now, &request).map(Some),
         }
     }
 
@@ -219,6 +224,19 @@ impl<M: Module> MetzConnect<M> {
         };
         Ok(Some(write_reply(8, sub_function, count)))
     }
+
+    /// Puts register 65 where it belongs among those of the module, which knows nothing of it: function
+    /// 3 or 4 may ask for all of them together.
+    fn tell_line(&self, pdu: &[u8], mut reply: Vec<u8>) -> Vec<u8> {
+        if let ([3 | 4, high, low, ..], true) = (pdu, M::LINE_IS_READ) {
+            let first = u16::from_be_bytes([*high, *low]);
+            let at = LINE_REGISTER.checked_sub(first).map(|number| 2 + 2 * usize::from(number));
+            if let Some(word) = at.and_then(|at| reply.get_mut(at..at + 2)) {
+                word.copy_from_slice(&self.line_codes().to_be_bytes());
+            }
+        }
+        reply
+    }
 }
 
 impl<M: Module> SimulatedDevice for MetzConnect<M> {
@@ -241,6 +259,9 @@ impl<M: Module> SimulatedDevice for MetzConnect<M> {
                 if addressed == Addressed::Unit {
                     self.counters.exceptions = self.counters.exceptions.wrapping_add(1);
                 }
+            let told = self.answer(now, pdu).map(|reply| reply.map(|reply| self.tell_line(pdu, reply)));
+            told.unwrap_or_else(|exception| {
+                self.counters.exceptions = self.counters.exceptions.wrapping_add(1);
                 Some(exception_reply(pdu.first().copied().unwrap_or(0), exception))
             })
         };
