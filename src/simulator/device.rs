@@ -97,6 +97,8 @@ pub enum Stimulus {
     HandVolts { output: u8, volts: Option<f64> },
     /// What is connected to an input.
     Input { input: u8, signal: Signal },
+    /// Somebody presses the button of a relay, and holds it for so long.
+    Press { relay: u8, held: Duration },
     /// What one of three phases carries; the other quantities stay.
     Phase { phase: u8, quantity: PhaseQuantity, amount: f64 },
     /// One of the small switches behind the front.
@@ -531,6 +533,8 @@ mod tests {
                 .prop_map(|(toggle, position)| Stimulus::Toggle { toggle, position }),
             (0..6u8, 0.0..12.0f64)
                 .prop_map(|(output, volts)| Stimulus::HandVolts { output, volts: Some(volts) }),
+            (0..6u8, 0..2000u64)
+                .prop_map(|(relay, held)| Stimulus::Press { relay, held: Duration::from_millis(held) }),
             (0..5u8, 0..5usize, -200.0..1200.0f64).prop_map(|(phase, quantity, amount)| {
                 let quantity = [
                     PhaseQuantity::Volts,

@@ -54,6 +54,7 @@ pub const COMMANDS: &str =
                                             MR-Multi I/O: 12 is S0)
   unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4, MR-Multi I/O: 12)
   unit N input I counter COUNT              sets a pulse counter (MR-SI4, MR-Multi I/O: 12)
+  unit N relay R press TIME                 somebody holds a relay's button for so long (MR-Multi I/O)
   unit N phase P volts X | amps X | hertz X | lag X | angle X
                                             a phase: its current lags its voltage by degrees, which is
                                             at an angle to that of phase 1 (MR-SM3)
@@ -146,6 +147,9 @@ fn parse_action(unit: u8, command: &[&str]) -> Result<Action, String> {
         }
         ["dip", switch, state @ ("on" | "off")] => {
             Stimulus::Dip { switch: parse_number("switch", switch)?, on: *state == "on" }
+        }
+        ["relay", relay, "press", held] => {
+            Stimulus::Press { relay: parse_number("relay", relay)?, held: parse_duration(held)? }
         }
         ["phase", phase, quantity, amount] => Stimulus::Phase {
             phase: parse_number("phase", phase)?,
@@ -316,6 +320,11 @@ mod tests {
             ("unit 5 set 'input 0' 215", 0, stimulate(5, set(Table::Input, 0, &[215]))),
             ("unit 5 set holding 9 -5 0x00FF", 0, stimulate(5, set(Table::Holding, 9, &[65531, 255]))),
             ("unit 5 motion", 0, stimulate(5, Stimulus::Motion)),
+                "unit 22 relay 4 press 1.2s",
+                0,
+                stimulate(22, Stimulus::Press { relay: 4, held: Duration::from_millis(1200) }),
+            ),
+            (
                 "unit 22 phase 2 angle -120",
                 0,
                 stimulate(22, Stimulus::Phase { phase: 2, quantity: PhaseQuantity::Angle, amount: -120.0 }),

@@ -51,6 +51,8 @@ const RELAYS: u8 = 0x0F;
 const CONTACTS: u8 = 11;
 /// The number of S0 among the digital inputs.
 const S0: u8 = 12;
+/// "Ein langer Tastendruck (> 1s)" (page 89).
+const LONG_PRESS: Duration = Duration::from_secs(1);
 /// I among the analog inputs, counted from 0.
 const CURRENT_INPUT: usize = 6;
 /// "Spannung 0-10V, Maximum 11.5 V" of the float (page 93).
@@ -178,7 +180,19 @@ impl DigitalOutputs {
         self.commanded & !self.by_hand | self.hand_states & self.by_hand
     }
 
-    /// What long and short presses of a relay's button lead to (page 89).
+    /// A long press changes between automatic and hand, a short one switches in hand operation (page 89).
+    /// No page tells how a relay stands at first in hand operation: here it stays as it is.
+    fn press(&mut self, relay: u8, held: Duration) {
+        let bit = 1 << (relay - 1);
+        if held > LONG_PRESS {
+            self.hand_states = self.hand_states & !bit | self.commanded & bit;
+            self.by_hand ^= bit;
+        } else {
+            self.hand_states ^= bit & self.by_hand;
+        }
+    }
+
+    /// What such presses lead to.
     fn set_hand(&mut self, relay: u8, position: Hand) {
         let bit = 1 << (relay - 1);
         self.by_hand = if position == Hand::Automatic { self.by_hand & !bit } else { self.by_hand | bit };
@@ -325,7 +339,8 @@ impl Module for MrMultiIo {
         match *stimulus {
             Stimulus::Button => self.pulse_input.press_button(),
             Stimulus::Hand { relay: relay @ 1..=4, position } => self.outputs.set_hand(relay, position),
-            Stimulus::Hand { relay, .. } => {
+            Stimulus::Press { relay: relay @ 1..=4, held } => self.outputs.press(relay, held),
+            Stimulus::Hand { relay, .. } | Stimulus::Press { relay, .. } => {
                 return Err(format!("relay {relay} is not there; {product} has 1 to 4"));
             }
             Stimulus::Input { input: S0, signal } => self.pulse_input.connect(now, signal, product)?,

@@ -153,6 +153,33 @@ fn a_relay_switched_by_hand_says_so_and_does_not_obey_the_bus_page_89() {
 }
 
 #[test]
+fn a_long_press_changes_a_relay_s_mode_and_a_short_one_switches_it_by_hand_page_89() {
+    let mut bench = bench();
+    bench.check(&[("06 0047 0022", "06 0047 0022")]);
+    // The states of the relays and which a hand has switched, after each press of the second's button.
+    for (press, states, by_hand) in [
+        // In automatic operation a short press does nothing.
+        ("0.5s", 0x22, 0),
+        ("1001ms", 0x22, 2),
+        ("0.5s", 0x20, 2),
+        ("1s", 0x22, 2),
+        ("999ms", 0x20, 2),
+        // What the bus says rules again, and hand operation begins with it.
+        ("2s", 0x22, 0),
+        ("2s", 0x22, 2),
+    ] {
+        act(&mut bench, &format!("relay 2 press {press}"));
+        bench.check(&[("03 0047 0002", &format!("03 04 {states:04X} {by_hand:04X}"))]);
+    }
+    // The bus switches it off behind the hand's back.
+    bench.check(&[("06 0047 0000", "06 0047 0000"), ("03 0047 0001", "03 02 0002")]);
+    act(&mut bench, "relay 2 press 2s");
+    act(&mut bench, "relay 2 press 2s");
+    bench.check(&[("03 0047 0002", "03 04 0000 0002")]);
+    assert!(bench.act("relay 5 press 2s").is_err());
+}
+
+#[test]
 fn analog_outputs_give_10_24_volts_at_32767_page_90() {
     let mut bench = bench();
     bench.check(&[
