@@ -412,6 +412,35 @@ fn the_time_that_s0_is_closed_is_counted_in_seconds_page_96() {
 }
 
 #[test]
+fn without_power_no_time_is_counted_and_the_parts_of_a_second_are_lost_page_96() {
+    let mut bench = bench();
+    act(&mut bench, "input 12 contact closed");
+    bench.wait(3999);
+    bench.check(&[("03 0052 0002", "03 04 0000 0003")]);
+    // Nobody asks, and the device is started anew: it had no power.
+    bench.wait(60_000);
+    act(&mut bench, "restart");
+    bench.wait(999);
+    bench.check(&[("03 0052 0002", "03 04 0000 0003")]);
+    bench.wait(1);
+    bench.check(&[("03 0052 0002", "03 04 0000 0004")]);
+}
+
+#[test]
+fn the_watchdog_begins_anew_with_a_restart_page_87() {
+    let mut bench = bench();
+    bench.check(&[("06 0042 0032", "06 0042 0032")]);
+    bench.wait(600);
+    assert_eq!(bench.output("red_light"), "ON");
+    act(&mut bench, "restart");
+    assert_eq!(bench.output("red_light"), "OFF");
+    bench.wait(499);
+    assert_eq!(bench.output("red_light"), "OFF");
+    bench.wait(1);
+    assert_eq!(bench.output("red_light"), "ON");
+}
+
+#[test]
 fn the_counter_has_48_bits_in_four_registers_page_97() {
     let mut bench = bench();
     act(&mut bench, "input 12 counter 281474976710655");

@@ -532,6 +532,19 @@ fn fault_bits_stop_the_recording_with_what_led_to_them_page_83() {
 }
 
 #[test]
+fn a_fault_is_found_at_the_next_measurement_however_late_somebody_asks_page_84() {
+    let mut bench = net();
+    bench.check(&[("10 0078 0006 0C 000A 000A 0064 0064 0000 0010", "10 0078 0006")]);
+    bench.wait(950);
+    act(&mut bench, &["phase 2 volts 115"]);
+    bench.wait(5050);
+    // The recording ended 50 ms after the change, five seconds ago.
+    check_words(&mut bench, 126, &[0x0010, 0x0001]);
+    check_signed(&mut bench, 512, &[-2817]);
+    check_signed(&mut bench, 576, &[1408]);
+}
+
+#[test]
 fn a_curve_shows_a_voltage_that_is_too_low_to_be_measured() {
     let mut bench = bench(&["phase 1 volts 20"]);
     check_words(&mut bench, 1, &[0]);
