@@ -239,6 +239,8 @@ impl Signal {
             _ => None,
         }
     }
+}
+
 /// What there is to a phase; voltage and current are root mean squares, angles are in degrees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PhaseQuantity {
@@ -321,9 +323,7 @@ pub enum Model {
 }
 
 impl Model {
-    pub const ALL: [Model; 19] = [
-    pub const ALL: [Model; 15] = [
-    pub const ALL: [Model; 16] = [
+    pub const ALL: [Model; 21] = [
         Model::MrDo4,
         Model::MrSi4,
         Model::MrAi8,

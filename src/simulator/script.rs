@@ -9,8 +9,7 @@
 
 use crate::engine::address::{Span, Table};
 use crate::engine::time::Duration;
-use crate::simulator::device::{Hand, Quantity, Signal, Stimulus, Toggle, parse_unit};
-use crate::simulator::device::{Hand, PhaseQuantity, Signal, Stimulus};
+use crate::simulator::device::{Hand, PhaseQuantity, Quantity, Signal, Stimulus, Toggle, parse_unit};
 use crate::simulator::fault::Fault;
 
 /// What a line of a script does.
@@ -32,40 +31,32 @@ pub struct Step {
 
 /// The commands, as the help shows them.
 pub const COMMANDS: &str =
-    "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4, MR-DIO4/2)
-    "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4, MR-Multi I/O)
+    "  unit N relay R hand on|off|automatic      a relay's hand switch (MR-DO4, MR-DIO4/2, MR-Multi I/O)
+  unit N relay R press TIME                 somebody holds a relay's button for so long (MR-Multi I/O)
   unit N triac T hand on|off|automatic      a triac's hand switch (MR-TO4)
   unit N toggle T up|middle|down            a switch with three positions (MR-TP)
   unit N output O hand X|automatic          volts that a person sets (MR-AOP4)
   unit N input I ohms X | volts X | celsius X | open
-                                            what is connected to an input (MR-AI8, MR-AIO4/2)
+                                            what is connected to an input (MR-AI8, MR-AIO4/2,
+                                            MR-Multi I/O)
   unit N input I ohms X | volts X | open    a leak sensor, the voltage at its Zener diode (MR-LD6)
-  unit N input I volts X | milliamps X | open
-                                            what is connected to an input (MR-CI4, analog-in8)
-  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-DIO4/2, MR-TP,
-                                            analog-in8)
-  unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4)
-  unit N input I counter COUNT              sets a pulse counter (MR-SI4)
-                                            what is connected to an input (MR-AI8, MR-Multi I/O)
   unit N input I volts X | milliamps X | open
                                             what is connected to an input (MR-CI4, analog-in8;
                                             MR-Multi I/O: 7 is I)
-  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, analog-in8,
-                                            MR-Multi I/O: 12 is S0)
-  unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4, MR-Multi I/O: 12)
-  unit N input I counter COUNT              sets a pulse counter (MR-SI4, MR-Multi I/O: 12)
-  unit N relay R press TIME                 somebody holds a relay's button for so long (MR-Multi I/O)
+  unit N input I contact closed|open        a contact (MR-SI4, MR-DI4, MR-DI10, MR-DIO4/2, MR-TP,
+                                            analog-in8; MR-Multi I/O: 12 is S0)
+  unit N input I pulses COUNT [every 80ms]  closings of a contact (MR-SI4; MR-Multi I/O: 12)
+  unit N input I counter COUNT              sets a pulse counter (MR-SI4; MR-Multi I/O: 12)
   unit N phase P volts X | amps X | hertz X | lag X | angle X
                                             a phase: its current lags its voltage by degrees, which is
                                             at an angle to that of phase 1 (MR-SM3)
   unit N dip D on|off                       a DIP switch (MR-CI4)
-  unit N button                             somebody presses the button (MR-SI4)
+  unit N button                             somebody presses the button (MR-SI4, MR-Multi I/O)
   unit N measure QUANTITY X                 what is around a sensor (sensor): humidity, temperature, co2,
                                             voc, co, volts, milliamps, oxygen, air_pressure, pressure,
                                             light, flow; door, window, switch with `open` or `closed`
   unit N motion                             somebody moves (sensor)
   unit N set 'TABLE ADDRESS' WORD …         raw words from there on, as in `set 'input 0' 215` (--profile)
-  unit N button                             somebody presses the button (MR-SI4, MR-Multi I/O)
   unit N power off|on                       power loss: only the EEPROM is kept
   unit N restart                            the same, and silent for two seconds
   unit N fault KIND | none                  see --fault
@@ -320,6 +311,7 @@ mod tests {
             ("unit 5 set 'input 0' 215", 0, stimulate(5, set(Table::Input, 0, &[215]))),
             ("unit 5 set holding 9 -5 0x00FF", 0, stimulate(5, set(Table::Holding, 9, &[65531, 255]))),
             ("unit 5 motion", 0, stimulate(5, Stimulus::Motion)),
+            (
                 "unit 22 relay 4 press 1.2s",
                 0,
                 stimulate(22, Stimulus::Press { relay: 4, held: Duration::from_millis(1200) }),

@@ -30,7 +30,6 @@ use crate::simulator::device::{
     Addressed, LineSettings, Overheard, Parity, SimulatedDevice, Stimulus, check_eeprom_length,
 };
 use crate::simulator::pdu::{Exception, Request, exception_reply, identification_reply, write_reply};
-use crate::simulator::pdu::{Exception, Request, exception_reply, words_reply, write_reply};
 
 /// The chapter of one device: its registers, its process side, its EEPROM.
 pub trait Module: Send {
@@ -43,8 +42,6 @@ pub trait Module: Send {
     const LINE_FUNCTIONS: &'static [u8] = &[6, 16];
     /// Whether register 65 can be read, too. [`Module::serve`] then has any word there.
     const READS_LINE: bool = false;
-    /// Whether register 65 can be read, too: only some chapters have it in their lists of function 3.
-    const LINE_IS_READ: bool = false;
 
     /// Answers a request with one of `FUNCTIONS`, for anything but register 65.
     fn serve(&mut self, now: Time, request: &Request) -> Result<Vec<u8>, Exception>;
@@ -127,7 +124,6 @@ impl<M: Module> MetzConnect<M> {
             _ => {
                 let mut reply = self.module.serve(now, &request)?;
                 if M::READS_LINE {
-                if M::LINE_IS_READ {
                     self.tell_line(&request, &mut reply);
                 }
                 Ok(Some(reply))
@@ -138,7 +134,7 @@ impl<M: Module> MetzConnect<M> {
     /// Puts register 65 where it stands in the reply to a read. Its high byte is the magic number of
     /// writes, of which the manual does not say that it can be read: here it is 0.
     fn tell_line(&self, request: &Request, reply: &mut [u8]) {
-        let Request::Read { function: 3, first, .. } = *request else { return };
+        let Request::Read { function: 3 | 4, first, .. } = *request else { return };
         let Some(before) = LINE_REGISTER.checked_sub(first) else { return };
         if let Some(word) = reply.get_mut(2 + 2 * usize::from(before)..).and_then(|rest| rest.get_mut(..2)) {
             word.copy_from_slice(&self.line_code().to_be_bytes());
@@ -149,24 +145,6 @@ impl<M: Module> MetzConnect<M> {
     fn line_code(&self) -> u16 {
         let parity = PARITIES.iter().position(|parity| *parity == self.line.parity).map_or(0, |at| at + 1);
         // A bit rate that register 65 has no code for is the line's own: 0, "not set".
-    /// Puts register 65 where it belongs among the module's own, which knows nothing of it.
-    fn tell_line(&self, request: &Request, reply: &mut [u8]) {
-        let Request::Read { function: 3 | 4, first, .. } = request else { return };
-        let at = LINE_REGISTER.checked_sub(*first).map(|number| 2 + 2 * usize::from(number));
-        if let Some(word) = at.and_then(|at| reply.get_mut(at..at + 2)) {
-            word.copy_from_slice(&self.line_codes().to_be_bytes());
-            Request::Read { function: 3, first: LINE_REGISTER, count: 1 } if M::LINE_IS_READ => {
-                Ok(Some(words_reply(3, &[self.line_codes()])))
-            }
-            _ => self.module.serve(now, &request).map(Some),
-        }
-    }
-
-    /// The codes of register 65. The magic number is of the request that changes them; what its byte
-    /// reads as is not told.
-    fn line_codes(&self) -> u16 {
-        let parity = PARITIES.iter().position(|parity| *parity == self.line.parity).map_or(0, |at| at + 1);
-        // A bit rate that register 65 has no code for is the line's own: stored as 0, "not set".
         let baud = BAUD_RATES.iter().position(|baud| *baud == self.line.baud).map_or(0, |at| at + 1);
         (parity << 4 | baud) as u16
     }
@@ -224,19 +202,6 @@ impl<M: Module> MetzConnect<M> {
         };
         Ok(Some(write_reply(8, sub_function, count)))
     }
-
-    /// Puts register 65 where it belongs among those of the module, which knows nothing of it: function
-    /// 3 or 4 may ask for all of them together.
-    fn tell_line(&self, pdu: &[u8], mut reply: Vec<u8>) -> Vec<u8> {
-        if let ([3 | 4, high, low, ..], true) = (pdu, M::LINE_IS_READ) {
-            let first = u16::from_be_bytes([*high, *low]);
-            let at = LINE_REGISTER.checked_sub(first).map(|number| 2 + 2 * usize::from(number));
-            if let Some(word) = at.and_then(|at| reply.get_mut(at..at + 2)) {
-                word.copy_from_slice(&self.line_codes().to_be_bytes());
-            }
-        }
-        reply
-    }
 }
 
 impl<M: Module> SimulatedDevice for MetzConnect<M> {
@@ -259,9 +224,6 @@ impl<M: Module> SimulatedDevice for MetzConnect<M> {
                 if addressed == Addressed::Unit {
                     self.counters.exceptions = self.counters.exceptions.wrapping_add(1);
                 }
-            let told = self.answer(now, pdu).map(|reply| reply.map(|reply| self.tell_line(pdu, reply)));
-            told.unwrap_or_else(|exception| {
-                self.counters.exceptions = self.counters.exceptions.wrapping_add(1);
                 Some(exception_reply(pdu.first().copied().unwrap_or(0), exception))
             })
         };
@@ -301,7 +263,6 @@ impl<M: Module> SimulatedDevice for MetzConnect<M> {
 
     fn eeprom(&self) -> Vec<u16> {
         let mut words = vec![self.line_code()];
-        let mut words = vec![self.line_codes()];
         words.extend(self.module.eeprom());
         words
     }

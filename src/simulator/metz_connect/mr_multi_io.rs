@@ -264,7 +264,7 @@ impl Module for MrMultiIo {
     /// The list of functions on page 87 leaves out 15, and the list of addresses below has it: "Write
     /// Multiple Coils (0 - 47)".
     const FUNCTIONS: &'static [u8] = &[1, 2, 3, 4, 5, 6, 15, 16];
-    const LINE_IS_READ: bool = true;
+    const READS_LINE: bool = true;
 
     fn serve(&mut self, now: Time, request: &Request) -> Result<Vec<u8>, Exception> {
         match *request {
@@ -378,7 +378,7 @@ impl Module for MrMultiIo {
         outputs.extend(self.volts.iter().enumerate().map(volts));
         outputs.extend(self.analog_inputs.outputs());
         outputs.push(("counter".into(), self.pulse_input.pulses.to_string()));
-        outputs.push(("red_light".into(), light(self.watchdog.is_expired())));
+        outputs.push(("red_light".into(), light(self.watchdog.has_expired())));
         outputs
     }
 

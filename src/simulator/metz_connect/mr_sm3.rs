@@ -290,7 +290,7 @@ impl Module for MrSm3 {
     const PRODUCT: &'static str = "MR-SM3";
     const VERSION: &'static str = "V1.2";
     const FUNCTIONS: &'static [u8] = &[3, 4, 6, 16];
-    const LINE_IS_READ: bool = true;
+    const READS_LINE: bool = true;
 
     fn serve(&mut self, _now: Time, request: &Request) -> Result<Vec<u8>, Exception> {
         match *request {
