@@ -166,7 +166,7 @@ impl Asked {
         }
         let quirks = self.device.as_ref().map(|device| device.wire.quirks).unwrap_or_default();
         let any_exception = quirks.exception_function_varies;
-        let request = Request { unit: self.unit, call: call.clone(), any_exception };
+        let request = Request { any_exception, ..Request::new(self.unit, call.clone()) };
         let reply = self.link.ask(&request, self.timeout).map_err(|lost| anyhow!("{lost}"))?;
         match reply.result {
             Err(RequestError::Impossible(reason)) => Err(Failure::wrong(format!("{call}: {reason}"))),

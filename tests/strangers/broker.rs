@@ -109,6 +109,16 @@ impl Listener {
         }
     }
 
+    /// What `topic` has said last, as far as it has been listened to.
+    pub fn says(&self, topic: &str) -> Option<&str> {
+        self.last.get(topic).map(String::as_str)
+    }
+
+    /// What `topic` has said until now does not count any more.
+    pub fn forget(&mut self, topic: &str) {
+        self.last.remove(topic);
+    }
+
     /// Compares what `topic` has said last.
     #[track_caller]
     pub fn check(&self, topic: &str, is_it: impl Fn(&str) -> bool) {

@@ -204,7 +204,7 @@ impl DeviceState {
 
     pub(super) fn request(&self, call: Call) -> Request {
         let any_exception = self.settings.device.wire.quirks.exception_function_varies;
-        Request { unit: self.settings.unit, call, any_exception }
+        Request { unit: self.settings.unit, call, any_exception, is_probe: self.patience.is_probing() }
     }
 
     /// The point is wanted now, and told even if it has not changed.
@@ -310,7 +310,7 @@ impl DeviceState {
 
     fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         self.patience.unanswered();
-        self.paused_until = now + self.patience.pause(self.asked_timeout);
+        self.paused_until = now + self.patience.pause(self.asked_timeout, self.settings.unit);
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {
             let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row");
             context.say(Severity::Warning, format!("device {} is offline: {reason}", self.settings.name));

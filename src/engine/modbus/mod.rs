@@ -27,12 +27,15 @@ pub struct Request {
     /// Take an exception of any function code as the answer: the device has the quirk
     /// `exception_function_varies`.
     pub any_exception: bool,
+    /// Only asks whether a silent device is there again: without an answer in time the line does not
+    /// wait for a late one, which unit, function and checksum tell apart from others'.
+    pub is_probe: bool,
 }
 
 impl Request {
     /// The request to a device that keeps to the specification.
     pub const fn new(unit: u8, call: Call) -> Request {
-        Request { unit, call, any_exception: false }
+        Request { unit, call, any_exception: false, is_probe: false }
     }
 }
 

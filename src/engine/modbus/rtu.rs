@@ -5,7 +5,8 @@
 //!   (or the returned address and value) are those asked for. It is found at any place, so noise
 //!   before and after it does no harm. Everything else is counted and the wait goes on.
 //! * After a request without an answer the line stays silent for a quarantine, in which a late
-//!   reply is dropped. It ends early when that reply comes.
+//!   reply is dropped. It ends early when that reply comes. After a probe of a silent device it lasts
+//!   as long as that device's replies have come late before: for most not at all.
 //! * A reply later than the quarantine may meet the next request. If it differs in unit, function
 //!   or count it is told apart. If it does not, the first reply to such a request is believed only
 //!   if no second one comes before its deadline; if one does, the second is the answer. The limit:
@@ -13,6 +14,8 @@
 //!   the same shape waits, and leaves that one unanswered, cannot be told from a good one.
 //! * Some adapters return our own bytes. Such an echo is skipped and remembered: the replies to
 //!   functions 5, 6 and 8 look like it.
+
+use std::collections::BTreeMap;
 
 use crate::engine::modbus::pdu;
 use crate::engine::modbus::rtu_bytes::{
@@ -60,6 +63,8 @@ pub struct Guard {
     busy_until: Option<Time>,
     quarantine_until: Option<Time>,
     unanswered: Vec<Unanswered>,
+    /// How late each unit's latest reply came, behind its timeout.
+    lateness: BTreeMap<u8, Duration>,
     discarded: Discarded,
 }
 
@@ -114,6 +119,7 @@ impl Guard {
             busy_until: None,
             quarantine_until: None,
             unanswered: Vec::new(),
+            lateness: BTreeMap::new(),
             discarded: Discarded::default(),
         }
     }
@@ -339,7 +345,11 @@ impl Guard {
     /// The deadline has passed.
     fn unanswered(&mut self, now: Time, waiting: Waiting) -> Reply {
         let reply = self.failed(waiting.clone(), false);
-        self.quarantine_until = Some(now + self.quarantine.unwrap_or(waiting.timeout));
+        let quarantine = match waiting.request.is_probe {
+            true => self.lateness.get(&waiting.request.unit).copied().unwrap_or_default() * 2,
+            false => self.quarantine.unwrap_or(waiting.timeout),
+        };
+        self.quarantine_until = Some(now + quarantine);
         self.remember(&waiting, now);
         reply
     }
@@ -415,6 +425,11 @@ impl Guard {
     fn notice_late_reply(&mut self) {
         for at in 0..self.heard.len() {
             if let Some((index, length)) = late_reply(&self.heard[at..], &self.unanswered, &[]) {
+                let late = &self.unanswered[index];
+                if let Some(heard_at) = self.heard_at.get(at + length - 1) {
+                    let lateness = self.lateness.entry(late.request.unit).or_default();
+                    *lateness = (*lateness).max(heard_at.since(late.at));
+                }
                 // The quarantine waits for the last one.
                 if index + 1 == self.unanswered.len() {
                     self.quarantine_until = None;

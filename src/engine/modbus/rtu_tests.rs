@@ -449,3 +449,30 @@ fn piece() -> impl Strategy<Value = Vec<u8>> {
         Just(relay),
     ]
 }
+
+#[test]
+fn after_a_probe_the_line_waits_only_as_long_as_that_unit_has_come_late_before() {
+    let probe = || Request { is_probe: true, ..two_inputs() };
+    let mut scene = Scene::without_echo();
+    scene.ask(&probe());
+    scene.expect("no answer", Err(RequestError::Timeout));
+    // Another unit is asked at once; the late reply meets its request and is told apart.
+    let other = read(2, Table::Input, 0, 2);
+    let given_up_at = scene.now;
+    scene.ask(&other);
+    assert!(scene.now - given_up_at <= whole_micros(LINE.frame_gap()), "{:?}", scene.now - given_up_at);
+    scene.wait(5).hears(framed("01 04 04 00 63 00 63")).wait(20).hears(framed("02 04 04 00 01 00 02"));
+    assert_eq!(scene.expect("the other", words(&[1, 2])), counts([0, 1, 0, 0, 0]));
+
+    // One that is heard between two requests says how late that unit is.
+    scene.ask(&probe());
+    scene.expect("no answer", Err(RequestError::Timeout));
+    let given_up_at = scene.now;
+    scene.wait(30).hears(framed("01 04 04 00 63 00 63"));
+    scene.ask(&probe());
+    scene.expect("no answer again", Err(RequestError::Timeout));
+    let next_given_up_at = scene.now;
+    assert_eq!(scene.guard.begin(scene.now, &other, TIMEOUT), None);
+    assert_eq!(scene.guard.earliest_send(scene.now), next_given_up_at + Duration::from_millis(60));
+    assert!(next_given_up_at > given_up_at);
+}
