@@ -67,6 +67,37 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 65, 65, ALL),
         ],
     ),
+    // 65 on page 24 too, the rest on pages 21 to 24.
+    (
+        "metz-connect/mr-dio42",
+        &[
+            (Table::Coil, 0, 5, ALL),
+            (Table::Coil, 8, 9, ALL),
+            (Table::Discrete, 0, 3, ALL),
+            (Table::Discrete, 8, 15, ALL),
+            (Table::Input, 0, 2, 0xFF0F),
+            (Table::Holding, 0, 0, 0x033F),
+            (Table::Holding, 1, 1, 0x0003),
+            (Table::Holding, 2, 17, ALL),
+            (Table::Holding, 18, 19, 0x0F0F),
+            (Table::Holding, 65, 66, ALL),
+        ],
+    ),
+    // 65 on page 3, the rest on pages 36 to 42.
+    (
+        "metz-connect/mr-tp",
+        &[
+            (Table::Coil, 0, 5, ALL),
+            (Table::Discrete, 0, 15, ALL),
+            (Table::Input, 0, 0, ALL),
+            (Table::Holding, 0, 0, 0x003F),
+            (Table::Holding, 1, 1, 0x00FF),
+            (Table::Holding, 2, 2, 0xF7FF),
+            (Table::Holding, 3, 3, 0x003F),
+            (Table::Holding, 4, 7, ALL),
+            (Table::Holding, 65, 66, ALL),
+        ],
+    ),
     // Page 44.
     ("metz-connect/mr-ao4", &[(Table::Holding, 0, 7, ALL), (Table::Holding, 65, 66, ALL)]),
     // Page 46.
@@ -162,6 +193,22 @@ const MANUALS: &[(&str, &[Registers])] = &[
             (Table::Holding, 93, 93, 0x0001),
             (Table::Holding, 94, 94, ALL),
             (Table::Holding, 95, 95, 0x0001),
+        ],
+    ),
+    // 65 on page 3, the rest on pages 104 to 108.
+    (
+        "metz-connect/mr-ld6",
+        &[
+            (Table::Coil, 0, 1, ALL),
+            (Table::Discrete, 0, 5, ALL),
+            (Table::Discrete, 16, 21, ALL),
+            (Table::Input, 0, 1, 0x003F),
+            (Table::Input, 2, 13, ALL),
+            (Table::Holding, 0, 1, 0x0003),
+            (Table::Holding, 2, 15, ALL),
+            (Table::Holding, 16, 20, 0x003F),
+            (Table::Holding, 21, 36, ALL),
+            (Table::Holding, 65, 66, ALL),
         ],
     ),
     // BTR, chapters 10.1 and 10.2.

@@ -53,7 +53,18 @@ const STATES: &[State] = &[
     ),
     ("metz-connect/mr-multi-io", "pt1000 as float, °F", &[("channel_1_code", 0x84), ("temperature_unit", 1)]),
     ("metz-connect/mr-multi-io", "current as integer", &[("current_code", 1)]),
+    ("metz-connect/mr-dio42", "motorized, safe is open", &[("mode", 1)]),
+    ("metz-connect/mr-dio42", "motor 2, safe is closed", &[("mode", 8)]),
+    ("metz-connect/mr-dio42", "two switches of one damper", &[("mode", 3)]),
+    ("metz-connect/mr-dio42", "a switch of each of two dampers", &[("mode", 4)]),
+    ("metz-connect/mr-dio42", "fire dampers", &[("mode", 6)]),
+    ("metz-connect/mr-dio42", "input logic", &[("mode", 9)]),
+    ("metz-connect/mr-dio42", "input logic beside a damper", &[("channel_1_mode", 9), ("channel_2_mode", 2)]),
+    ("metz-connect/mr-ld6", "combinations", &[("mode", 4)]),
+    ("metz-connect/mr-ld6", "relays on the bus, cables not watched", &[("mode", 5), ("break_watched", 0)]),
     ("metz-connect/mr-si4", "three decimals", &[("decimals", 3)]),
+    ("metz-connect/mr-tp", "relays by hand only", &[("mode", 0)]),
+    ("metz-connect/mr-tp", "two blinds", &[("mode", 3)]),
 ];
 
 /// The message of a fresh device, and for each further state the components that differ from it.
