@@ -31,6 +31,7 @@ fn the_gateway_reads_every_point_and_writes_every_setting_of_the_simulated_devic
     let mut gateway = Gateway::start(&configuration);
 
     let (mut read, mut written) = (0, 0);
+    let mut disagreements = Vec::new();
     for device in &devices {
         let points = points(device.model.id());
         let device = name_of(device);
@@ -45,11 +46,24 @@ fn the_gateway_reads_every_point_and_writes_every_setting_of_the_simulated_devic
                 read += 1;
             }
             if let Some(value) = value_to_write(point) {
-                check_write(&mut listener, &topic(&device, point), &value);
+                let outcome = write(&mut listener, &topic(&device, point), &value);
                 written += 1;
+                if !is_taken(&outcome) && !is_rightly_not_taken(&topic(&device, point), &outcome) {
+                    disagreements.push(format!("{}: {value}: {outcome}", topic(&device, point)));
+                }
             }
         }
     }
+    // A fault has stopped the recording of the first voltage; the curve comes when somebody asks for it.
+    let curve = "busker/metz_connect_mr_sm3/phase_1_waveform";
+    listener.wait("busker/metz_connect_mr_sm3/recording", |payload| payload == "stopped");
+    listener.publish(&format!("{curve}/get"), "");
+    listener.wait(curve, |payload| {
+        serde_json::from_str::<Vec<f64>>(payload).is_ok_and(|samples| samples.len() == 128)
+    });
+
+    // Which of the two is wrong, the manual knows.
+    assert!(disagreements.is_empty(), "{}", disagreements.join("\n"));
     // A test that finds no points would find no disagreement either.
     assert!(read > 700 && written > 500, "{read} read, {written} written");
     gateway.end();
@@ -66,19 +80,49 @@ fn bring_to_life(listener: &mut Listener, device: &str, points: &[Value], point:
         }
         let name = names[0].as_str().expect("a name");
         if selector["access"] == "rw" {
-            check_write(listener, &topic(device, selector), name);
+            let outcome = write(listener, &topic(device, selector), name);
+            assert!(is_taken(&outcome), "{}: {name}: {outcome}", topic(device, selector));
         }
         listener.wait(&topic(device, selector), |payload| payload == name);
     }
 }
 
-fn check_write(listener: &mut Listener, topic: &str, value: &str) {
+/// How a command ended.
+fn write(listener: &mut Listener, topic: &str, value: &str) -> String {
     let outcome = format!("{topic}/outcome");
     listener.forget(&outcome);
     listener.publish(&format!("{topic}/set"), value);
     listener.wait(&outcome, |_| true);
-    // Which of the two is wrong, the manual knows.
-    listener.check(&outcome, |payload| payload.contains("\"done\"") || payload.contains("\"unchanged\""));
+    listener.says(&outcome).unwrap_or_default().to_string()
+}
+
+fn is_taken(outcome: &str) -> bool {
+    outcome.contains("\"done\"") || outcome.contains("\"unchanged\"")
+}
+
+/// Writes that the device, as it stands here, does not take, each with the reason.
+const RIGHTLY_NOT_TAKEN: &[(&str, &str, &str)] = &[
+    // No end contact is closed, so that the damper is in its fire position and the alarm comes back (page 30).
+    ("metz_connect_mr_dio42/channel_", "_alarm", "\"found\":\"alarm\""),
+    // The same input toggles this relay already; the device keeps the two apart (page 34).
+    ("metz_connect_mr_dio42/channel_", "_follows_input_1", "exception 3"),
+    ("metz_connect_mr_dio42/channel_", "_follows_input_2", "exception 3"),
+    ("metz_connect_mr_dio42/channel_", "_follows_input_3", "exception 3"),
+    ("metz_connect_mr_dio42/channel_", "_follows_input_4", "exception 3"),
+    // An analog input sets it all the time (page 77).
+    ("metz_connect_mr_aio42/controller_", "_setpoint", "\"not_taken\""),
+    // This input is for a current, and so no contact (chapter 6.3.2).
+    ("fuehlersysteme_analog_in8/", "channel_8_function", "\"found\":\"analog\""),
+    // The relay follows itself, a flag (RWreg 51 is 50).
+    ("fuehlersysteme_sensor/", "relay_off_below", "neither `ON` nor `OFF`"),
+    ("fuehlersysteme_sensor/", "relay_on_above", "neither `ON` nor `OFF`"),
+];
+
+fn is_rightly_not_taken(topic: &str, outcome: &str) -> bool {
+    let fits = |(begins, ends, says): &&(&str, &str, &str)| {
+        topic.contains(begins) && topic.ends_with(ends) && outcome.contains(says)
+    };
+    RIGHTLY_NOT_TAKEN.iter().find(fits).is_some()
 }
 
 fn name_of(device: &DeviceAt) -> String {
@@ -106,6 +150,9 @@ fn value_to_write(point: &Value) -> Option<String> {
         let is_lower = point["name"].as_str().is_some_and(is_lower);
         let raw = number(if is_lower { "min" } else { "max" });
         return Some(raw.checked_mul(number("scale")).expect("a small number").normalized().to_string());
+    }
+    if let Some(name) = point["writable_names"].as_array().and_then(|names| names.last()) {
+        return name.as_str().map(str::to_string);
     }
     let names = point["values"].as_object().expect("a map");
     if let Some(name) = names.values().next_back() {
