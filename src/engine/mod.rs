@@ -9,12 +9,14 @@ pub mod address;
 pub mod time;
 pub mod value;
 
-// Describe: what a device is, what the gateway shall do.
+// Describe: what a device is and what its words mean, what the gateway shall do.
+pub mod codec;
 pub mod configuration;
 pub mod device;
 pub mod profile;
 pub mod settings;
 pub mod units;
+pub mod wanted;
 pub mod yaml;
 
 // Ask: requests, replies, and which come when.
@@ -22,8 +24,7 @@ pub mod modbus;
 pub mod plan;
 pub mod schedule;
 
-// Understand: words to readings, and what changed.
-pub mod codec;
+// Understand: what is known of a device, and what changed.
 pub mod state;
 
 // Tell: topics, discovery, health, and what waits for the broker.
@@ -32,9 +33,11 @@ pub mod homeassistant;
 pub mod outbox;
 pub mod topics;
 
-// Obey: commands, and the bus that ties all of it together.
+// Obey: commands, settings, what outlives a restart, and the bus that ties all of it together.
 pub mod bus;
 pub mod command;
+pub mod memory;
+pub mod upkeep;
 
 #[cfg(test)]
 pub mod test_device;

@@ -4,7 +4,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use crate::engine::device::Device;
+use crate::engine::device::{Device, PointIndex};
 use crate::engine::time::Duration;
 
 #[derive(Clone, Debug, PartialEq)]
@@ -167,4 +167,16 @@ pub struct DeviceSettings {
     pub unit: u8,
     /// The profile with this device's own wishes applied.
     pub device: Device,
+    /// What its settings shall hold, in the file's order; each point once.
+    pub wanted: Vec<Wanted>,
+}
+
+/// A setting of a device, as its owner wants it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Wanted {
+    pub point: PointIndex,
+    /// As it was typed: `30s`, `ON`, `automatic`. What it means may depend on what the device holds.
+    pub value: String,
+    /// Whether it is written again when the device holds something else later.
+    pub enforce: bool,
 }

@@ -8,11 +8,11 @@ use std::path::{Path, PathBuf};
 /// Within a paragraph of `engine/mod.rs` rustfmt sorts the names; the order within is this one.
 const ENGINE_ORDER: &[&[&str]] = &[
     &["time", "value", "address"],
-    &["yaml", "device", "test_device", "units", "settings", "profile", "configuration"],
+    &["yaml", "device", "test_device", "codec", "units", "settings", "wanted", "profile", "configuration"],
     &["modbus", "plan", "schedule"],
-    &["codec", "state"],
+    &["state"],
     &["topics", "health", "homeassistant", "outbox"],
-    &["command", "bus"],
+    &["command", "memory", "upkeep", "bus"],
 ];
 
 /// What would let the engine wait, ask the time, open something, or answer differently from run to

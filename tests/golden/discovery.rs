@@ -122,6 +122,7 @@ fn payload(device: &Device, known: &[Option<i128>]) -> Value {
         bus: 0,
         unit: 1,
         device: device.clone(),
+        wanted: Vec::new(),
     };
     let message = announcement(&gateway, &settings, "bus", known).message();
     serde_json::from_str(&message.payload).expect("a discovery message is JSON")

@@ -14,7 +14,7 @@ use crate::engine::profile::file::{Intervals, Point, Presentation, Wire};
 use crate::engine::settings::{OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
 use crate::engine::value::Decimal;
-use crate::engine::yaml::{At, Definitions, Faults, Json, Map, Node, Read, record};
+use crate::engine::yaml::{At, Content, Definitions, Faults, Json, Map, Node, Read, Scalar, record};
 
 record! {
     /// The configuration of one gateway.
@@ -121,6 +121,59 @@ record! {
         home_assistant: Option<Later<Map<String, Presentation>>>,
         /// The periods of the poll classes.
         poll: Option<Part<Intervals>>,
+        /// What the device's settings shall hold, by the names of its points. Compared on each connect;
+        /// a difference is written once for each change of this section, a later one is reported.
+        settings: Option<Part<Map<String, Setting>>>,
+    }
+}
+
+/// What one setting shall hold: `30s`, or the longer form with `enforce`.
+#[derive(Clone, Debug)]
+pub struct Setting {
+    pub value: At<SettingValue>,
+    pub enforce: bool,
+}
+
+record! {
+    /// A setting that may be enforced.
+    pub struct LongSetting {
+        /// What it shall hold.
+        value: At<SettingValue>,
+        /// Whether it is written again when the device holds something else later.
+        enforce: bool = false,
+    }
+}
+
+impl Read for Setting {
+    fn read(node: &Node, faults: &mut Faults) -> Option<Setting> {
+        match node.content {
+            Content::Map(_) => LongSetting::read(node, faults)
+                .map(|LongSetting { value, enforce, .. }| Setting { value, enforce }),
+            Content::Scalar { .. } | Content::List(_) => {
+                At::<SettingValue>::read(node, faults).map(|value| Setting { value, enforce: false })
+            }
+        }
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        let short = <SettingValue as Scalar>::schema();
+        json!({"anyOf": [short, LongSetting::schema(definitions)]})
+    }
+}
+
+/// A number in the point's unit, a duration, a name, `ON` or `OFF`; only the point knows which.
+#[derive(Clone, Debug)]
+pub struct SettingValue(pub String);
+
+impl Scalar for SettingValue {
+    const EXPECTED: &'static str = "a value like `30s`, `21.5` or `ON`, or a map like `{value: 30s, enforce: true}`";
+
+    fn parse(text: &str) -> Result<SettingValue, String> {
+        Ok(SettingValue(text.into()))
+    }
+
+    fn schema() -> Json {
+        json!({"type": ["string", "number", "boolean"]})
     }
 }
 

@@ -1,9 +1,10 @@
 //! A configuration file to [`Settings`], or to every fault in it.
 //!
-//! [`file`] is the shape, `words` its scalars; here and in `wishes` are the rules beyond the shape.
+//! [`file`] is the shape, `words` its scalars; here, in `wishes` and in `wanted` are the rules beyond the shape.
 
 pub mod file;
 mod secrets;
+mod wanted;
 mod wishes;
 mod words;
 
@@ -15,7 +16,7 @@ use crate::engine::device::Device;
 use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Library};
 use crate::engine::settings::{
-    Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password, Settings,
+    Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password, Settings, Wanted,
 };
 use crate::engine::time::Duration;
 use crate::engine::yaml::{
@@ -55,6 +56,16 @@ pub fn profile_folders(file_name: &str, bytes: &[u8]) -> Vec<At<String>> {
     let node = source.and_then(|source| parse(&source, &mut faults));
     let folders = node.as_ref().and_then(|node| node.get("profiles"));
     folders.and_then(|folders| read(folders, &mut faults)).unwrap_or_default()
+}
+
+/// The settings in `bytes`, a file with nothing but what stands under a device's `settings:`.
+pub fn load_wanted(file_name: &str, bytes: &[u8], device: &Device) -> Result<Vec<Wanted>, Vec<Diagnostic>> {
+    let mut faults = Faults::default();
+    let source = Source::from_bytes(file_name, bytes, &mut faults);
+    let node = source.and_then(|source| parse(&source, &mut faults));
+    let settings = node.and_then(|node| read(&node, &mut faults));
+    let wanted = settings.map(|settings| wanted::check(&settings, device, &mut faults));
+    faults.into_result(wanted)
 }
 
 /// The JSON Schema of a configuration file.
@@ -276,12 +287,15 @@ impl Resolver<'_> {
             }
             let bus = self.bus_of(device, file);
             if let (Some(bus), Some(unit), Some(resolved)) = (bus, device.unit.get(), self.device(device)) {
+                let settings = read_part(&device.settings);
+                let wanted = settings.map(|settings| wanted::check(settings, &resolved, &mut self.faults));
                 devices.push(DeviceSettings {
                     name: name.0.clone(),
                     title: device.name.clone().unwrap_or_else(|| title(&name.0)),
                     bus,
                     unit: unit.value.0,
                     device: resolved,
+                    wanted: wanted.unwrap_or_default(),
                 });
             }
         }

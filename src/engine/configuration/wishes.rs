@@ -21,13 +21,16 @@ pub fn apply(node: &Node, device: &mut Device, faults: &mut Faults, warnings: &m
     }
 }
 
-fn unknown_point(name: &str, device: &Device) -> String {
-    let profile = &device.profile;
+pub(super) fn unknown_point(name: &str, device: &Device) -> String {
     let known: Vec<&str> = device.points.iter().map(|point| point.name.as_str()).collect();
+    let inline = device.profile == "inline";
+    let owner = if inline { "this device".into() } else { format!("`{}`", device.profile) };
     match nearest(name, &known) {
-        Some(meant) => format!("`{profile}` has no point `{name}`; did you mean `{meant}`?"),
+        Some(meant) => format!("{owner} has no point `{name}`; did you mean `{meant}`?"),
+        None if inline => format!("{owner} has no point `{name}`; its points stand under `points`"),
         None => {
-            format!("`{profile}` has no point `{name}`; `busker profiles show {profile}` lists its points")
+            let profile = &device.profile;
+            format!("{owner} has no point `{name}`; `busker profiles show {profile}` lists its points")
         }
     }
 }
