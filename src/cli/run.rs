@@ -4,6 +4,7 @@ use super::configuration::ConfigurationArgs;
 use super::{Failure, log};
 use crate::edge::app::App;
 use crate::edge::shutdown;
+use crate::edge::state_files::StateFiles;
 
 /// Run the gateway
 ///
@@ -26,7 +27,9 @@ pub fn run(args: Args) -> Result<(), Failure> {
         settings.http.listen = args.http;
     }
     let (buses, devices) = (settings.buses.len(), settings.devices.len());
-    let app = App::start(settings)?;
+    let names = settings.devices.iter().map(|device| device.name.as_str());
+    let state = StateFiles::open(&settings.state_dir, names)?;
+    let app = App::start(settings, state)?;
     if let Some(address) = app.http_address() {
         tracing::info!("HTTP on http://{address}/health");
     }

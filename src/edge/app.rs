@@ -16,6 +16,7 @@ use crate::edge::http::Http;
 use crate::edge::mqtt::{Broker, Mailbox, News};
 use crate::edge::reports::{Ask, Reporter};
 use crate::edge::shutdown::{self, Signals};
+use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Bus, Command, Event};
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::health::{self, GatewayReport};
@@ -41,11 +42,13 @@ pub struct App {
     http: Option<Http>,
     reporter: Arc<Reporter>,
     watch: JoinHandle<()>,
+    state: Arc<StateFiles>,
 }
 
 impl App {
-    /// Starts everything. An error means that nothing is left running.
-    pub fn start(settings: Settings) -> anyhow::Result<App> {
+    /// Starts everything, going on from what is remembered in `state`. An error means that nothing is left
+    /// running.
+    pub fn start(settings: Settings, state: StateFiles) -> anyhow::Result<App> {
         let password = files::read_password(&settings.mqtt.password)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
@@ -55,6 +58,7 @@ impl App {
             .context("the runtime cannot be started")?;
         let clock = Clock::start();
         let settings = Arc::new(settings);
+        let state = Arc::new(state);
         // What can fail comes before what cannot.
         let listener = match &settings.http.listen {
             Some(listen) => Some(runtime.block_on(Http::bind(listen))?),
@@ -65,17 +69,20 @@ impl App {
             Outbox::new(topics.clone(), &settings.home_assistant.prefix, identities(&settings, &topics));
         let mailbox = Arc::new(Mailbox::new(outbox));
         introduce(&settings, &topics, &mailbox);
-        let buses = Arc::new(start_buses(&settings, clock, &mailbox)?);
+        let buses = Arc::new(start_buses(&settings, clock, &state, &mailbox)?);
 
         let _inside = runtime.enter();
         let route = Route::new(&settings, topics.clone(), buses.clone(), mailbox.clone());
         let broker = Broker::start(&settings, password, clock, mailbox.clone(), move |news| route.tell(news));
-        let first = (0..buses.len()).map(|index| Bus::new(clock.now(), &settings, index).report(clock.now()));
-        let state = broker.state();
-        let reporter = Arc::new(Reporter::new(move || state.report(), questions(&buses), first.collect()));
+        let memories = state.memories();
+        let first = (0..buses.len())
+            .map(|index| Bus::new(clock.now(), &settings, index, memories).report(clock.now()))
+            .collect();
+        let connection = broker.state();
+        let reporter = Arc::new(Reporter::new(move || connection.report(), questions(&buses), first));
         let http = listener.map(|listener| Http::serve(listener, reporter.clone(), clock));
         let watch = tokio::spawn(watch(reporter.clone(), topics, mailbox));
-        Ok(App { runtime, buses, broker, http, reporter, watch })
+        Ok(App { runtime, buses, broker, http, reporter, watch, state })
     }
 
     /// Where HTTP listens, if it does.
@@ -116,6 +123,7 @@ impl App {
         }
         // A stuck bus's thread is not waited for again.
         self.runtime.shutdown_background();
+        self.state.finish();
     }
 }
 
@@ -141,13 +149,14 @@ fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
 fn start_buses(
     settings: &Arc<Settings>,
     clock: Clock,
+    state: &Arc<StateFiles>,
     mailbox: &Arc<Mailbox>,
 ) -> anyhow::Result<Vec<BusHandle>> {
     let mut buses: Vec<BusHandle> = Vec::new();
     for (index, bus) in settings.buses.iter().enumerate() {
         let mailbox = mailbox.clone();
         let publish = Box::new(move |message| mailbox.push(message));
-        match bus_thread::start(settings.clone(), index, clock, publish) {
+        match bus_thread::start(settings.clone(), index, clock, state.clone(), publish) {
             Ok(handle) => buses.push(handle),
             Err(error) => {
                 buses.iter().for_each(BusHandle::shutdown);

@@ -16,6 +16,7 @@ use crate::edge::bell::Bell;
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::{GuardedLink, wait};
 use crate::edge::link::{Link, Lost};
+use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Action, Bus, Event, Severity};
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
@@ -53,6 +54,7 @@ pub fn start(
     settings: Arc<Settings>,
     index: usize,
     clock: Clock,
+    state: Arc<StateFiles>,
     publish: Box<dyn Fn(Message) + Send>,
 ) -> std::io::Result<BusHandle> {
     let (letters, inbox) = sync_channel(WAITING_MAX);
@@ -61,10 +63,11 @@ pub fn start(
     let (thread_bell, thread_stop) = (bell.clone(), stop.clone());
     let thread =
         std::thread::Builder::new().name(format!("bus-{}", settings.buses[index].name)).spawn(move || {
-            let bus = Bus::new(clock.now(), &settings, index);
+            let bus = Bus::new(clock.now(), &settings, index, state.memories());
             let port = Port::Closed;
             let (bell, stop) = (thread_bell, thread_stop);
-            BusThread { settings, index, clock, publish, bus, port, inbox, bell, stop, stopping: false }
+            let stopping = false;
+            BusThread { settings, index, clock, state, publish, bus, port, inbox, bell, stop, stopping }
                 .run();
         })?;
     Ok(BusHandle { letters, bell, stop, thread: Mutex::new(Some(thread)) })
@@ -129,6 +132,7 @@ struct BusThread {
     settings: Arc<Settings>,
     index: usize,
     clock: Clock,
+    state: Arc<StateFiles>,
     publish: Box<dyn Fn(Message) + Send>,
     bus: Bus,
     port: Port,
@@ -176,6 +180,7 @@ impl BusThread {
                     self.line_said(begun);
                 }
                 Action::Publish(message) => (self.publish)(message),
+                Action::Store(record) => self.state.store(record),
                 Action::Reopen { after } => self.port = Port::Waiting(self.clock.now() + after),
                 Action::Say(Severity::Info, text) => tracing::info!("{text}"),
                 Action::Say(Severity::Warning, text) => tracing::warn!("{text}"),

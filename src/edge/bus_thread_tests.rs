@@ -33,11 +33,15 @@ fn line() -> (OwnedFd, String) {
     (far, path)
 }
 
+fn nowhere() -> Arc<StateFiles> {
+    Arc::new(StateFiles::nowhere())
+}
+
 fn run(settings: Arc<Settings>) -> (BusHandle, Receiver<Message>) {
     let (sender, messages) = channel();
     // The test may have heard enough.
     let publish = move |message| drop(sender.send(message));
-    let bus = start(settings, 0, Clock::start(), Box::new(publish)).expect("a thread");
+    let bus = start(settings, 0, Clock::start(), nowhere(), Box::new(publish)).expect("a thread");
     (bus, messages)
 }
 
@@ -123,7 +127,8 @@ fn what_does_not_fit_into_the_inbox_is_refused_and_not_waited_for() {
     let publish = move |_| {
         let _ = hold.lock().expect("one thread").recv();
     };
-    let bus = start(settings("/dev/no-such", "1s"), 0, Clock::start(), Box::new(publish)).expect("a thread");
+    let bus = start(settings("/dev/no-such", "1s"), 0, Clock::start(), nowhere(), Box::new(publish))
+        .expect("a thread");
     let taken = (0..=WAITING_MAX).filter(|_| bus.send(Event::BrokerUp).is_ok()).count();
     assert_eq!(taken, WAITING_MAX);
     assert_eq!(bus.send(Event::BrokerUp), Err(Full));

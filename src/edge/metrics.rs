@@ -93,7 +93,8 @@ fn wire_counters(registry: &mut Registry, of: &str, counted: Vec<(Labels, &Count
     for (index, (name, _)) in Counters::default().list().into_iter().enumerate() {
         let values =
             counted.iter().map(|(labels, counts)| (labels.clone(), counts.list()[index].1)).collect();
-        let help = format!("{} since the start", name.replace('_', " "));
+        let since = if name == "persistent_writes" { "installation" } else { "start" };
+        let help = format!("{} since the {since}", name.replace('_', " "));
         counters(registry, &format!("{of}_{name}"), &help, values);
     }
 }

@@ -12,3 +12,4 @@ pub mod metrics;
 pub mod mqtt;
 pub mod reports;
 pub mod shutdown;
+pub mod state_files;

@@ -22,7 +22,7 @@ pub struct Counters {
     pub echoes: u64,
     pub noise_bytes: u64,
     pub writes: u64,
-    /// Writes to points in EEPROM.
+    /// Writes to points in EEPROM, since the installation and not only since the start.
     pub persistent_writes: u64,
 }
 

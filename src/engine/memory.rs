@@ -131,7 +131,10 @@ mod tests {
         for (text, expected) in [
             ("", "EOF while parsing a value"),
             (&whole[..whole.len() / 2], "EOF while parsing"),
-            (&whole.replace("\"version\": 1", "\"version\": 2"), "its version is 2, and this program knows 1"),
+            (
+                &whole.replace("\"version\": 1", "\"version\": 2"),
+                "its version is 2, and this program knows 1",
+            ),
             ("{}", "its version is none"),
             (&whole.replace("persistent_writes", "writes"), "unknown field `writes`"),
             (&whole.replace("holding 3..7", "holding 7..3"), "`7..3` runs backwards"),

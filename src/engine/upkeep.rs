@@ -31,6 +31,7 @@ pub struct Upkeep {
     section: BTreeMap<String, String>,
     notes: Vec<Note>,
     told_drift: Vec<Drift>,
+    settled_changed: bool,
 }
 
 #[derive(Clone, Debug)]
@@ -74,12 +75,20 @@ enum Progress {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Standing {
     /// Not read yet, or what decides it is not yet known or not yet written.
-    Unknown { found: Option<String> },
+    Unknown {
+        found: Option<String>,
+    },
     Right,
     /// `command` is the wanted value as a command says it.
-    Differs { found: String, command: String },
+    Differs {
+        found: String,
+        command: String,
+    },
     /// It cannot be written as things are.
-    Faulty { found: Option<String>, reason: String },
+    Faulty {
+        found: Option<String>,
+        reason: String,
+    },
 }
 
 /// A setting that does not hold what is wanted.
@@ -141,7 +150,7 @@ impl Upkeep {
                 }
             })
             .collect();
-        Upkeep { wishes, section, notes: Vec::new(), told_drift: Vec::new() }
+        Upkeep { wishes, section, ..Upkeep::default() }
     }
 
     /// What is not yet written will not be, except where it is enforced: without a memory each start
@@ -149,7 +158,7 @@ impl Upkeep {
     pub fn write_nothing(&mut self, reason: &str) {
         for wish in self.wishes.iter_mut().filter(|wish| wish.progress == Progress::Due) {
             wish.progress = Progress::Rests;
-            wish.reason = Some(reason.to_string());
+            wish.reason = (!wish.enforce).then(|| reason.to_string());
         }
     }
 
@@ -162,6 +171,11 @@ impl Upkeep {
     pub fn settled(&self) -> BTreeMap<String, String> {
         let settled = |wish: &Wish| Some((wish.name.clone(), wish.settled.clone()?));
         self.wishes.iter().filter_map(settled).collect()
+    }
+
+    /// Whether more of them are settled than when this was last asked.
+    pub fn take_settled_changed(&mut self) -> bool {
+        std::mem::take(&mut self.settled_changed)
     }
 
     /// Nothing of what was read holds any more.
@@ -183,7 +197,13 @@ impl Upkeep {
             if wish.standing == Standing::Right {
                 wish.progress = Progress::Rests;
                 wish.reason = None;
-                wish.settled.get_or_insert_with(|| OutcomeKind::Unchanged.name().into());
+                wish.mending = false;
+                if wish.settled.is_none() {
+                    // After a write that nobody confirmed, it was that write.
+                    let kind = if wish.tries > 0 { OutcomeKind::Done } else { OutcomeKind::Unchanged };
+                    wish.settled = Some(kind.name().into());
+                    self.settled_changed = true;
+                }
             }
             let differs = matches!(wish.standing, Standing::Differs { .. });
             if differs && wish.enforce && wish.progress == Progress::Rests && now >= wish.mend_at {
@@ -218,6 +238,7 @@ impl Upkeep {
         let reason = outcome.reason.clone().unwrap_or_else(|| outcome.kind.name().into());
         let may_wait = self.wishes[index].progress == Progress::Due
             && self.wishes[index].coupled.iter().any(|other| self.wishes[*other].is_to_be_written());
+        self.settled_changed = true;
         let wish = &mut self.wishes[index];
         wish.tries += 1;
         match outcome.kind {
@@ -225,9 +246,11 @@ impl Upkeep {
                 if let (OutcomeKind::Done, Some(before)) = (outcome.kind, &wish.last_found) {
                     let again = if wish.mending { "was written again" } else { "was written" };
                     let holds = outcome.found.as_ref().unwrap_or(&wish.value);
-                    let text = format!("{} {again} as its settings want: {holds}, before {before}", wish.name);
+                    let text =
+                        format!("{} {again} as its settings want: {holds}, before {before}", wish.name);
                     self.notes.push(Note { is_warning: false, text });
                 }
+                wish.said = false;
                 wish.settle(outcome.kind, None);
                 for other in self.wishes[index].coupled.clone() {
                     let other = &mut self.wishes[other];
@@ -324,6 +347,7 @@ impl Upkeep {
             if !waits || wish.coupled.iter().any(|other| self.wishes[*other].is_to_be_written()) {
                 continue;
             }
+            self.settled_changed = true;
             let is_right = |other: &usize| self.wishes[*other].standing == Standing::Right;
             let helped = wish.coupled.iter().any(is_right);
             let wish = &mut self.wishes[index];
@@ -345,7 +369,7 @@ impl Upkeep {
                     let rest = match drift.reason {
                         Some(reason) => format!(" ({reason})"),
                         None if wish.enforce => String::new(),
-                        None => "; it is written again only if they change, or say `enforce: true`".into(),
+                        None => "; it is left so until they change, or say `enforce: true`".into(),
                     };
                     let text = format!("{} {found}, and its settings want {}{rest}", wish.name, wish.value);
                     self.notes.push(Note { is_warning: true, text });

@@ -22,7 +22,9 @@ pub fn refusal(point: &Point) -> Option<String> {
         return Some(format!("`{name}` is a button and holds no value; remove it"));
     }
     if !point.is_read() {
-        return Some(format!("`{name}` is never read, and a setting is compared before it is written; remove it"));
+        return Some(format!(
+            "`{name}` is never read, and a setting is compared before it is written; remove it"
+        ));
     }
     if !point.persistent && point.presentation.category != Some(Category::Config) {
         return Some(format!(
@@ -91,36 +93,37 @@ pub fn check(device: &Device, wanted: &[Wanted], index: usize) -> Result<(), Str
     let known = known_by(device, wanted);
     let undecided: Vec<PointIndex> =
         details.selectors().into_iter().filter(|selector| known[*selector].is_none()).collect();
-    let mut first_refusal = None;
+    // Each refusal, and what the undecided points held for it; those for want of a value come last.
+    let mut refusals: Vec<(String, String)> = Vec::new();
+    let mut without: Vec<(String, String)> = Vec::new();
     for meaning in meanings(device, *point, &undecided, &known) {
-        let judged = match codec::resolve(device, *point, &meaning) {
-            Ok(resolved) => encode(details, &resolved, value).map(drop),
-            Err(missing) => Err(without_value(device, *point, &meaning, &missing)),
+        let as_held = || {
+            let held: Vec<String> =
+                undecided.iter().map(|selector| format!("`{}`", held(device, *selector, &meaning))).collect();
+            held.join(" and ")
         };
-        match judged {
-            Ok(()) => return Ok(()),
-            // That there is no value in some mode says less than what is wrong with the value in another.
-            Err(reason) => {
-                let says_more = codec::resolve(device, *point, &meaning).is_ok();
-                if first_refusal.as_ref().is_none_or(|(_, said_more)| says_more && !said_more) {
-                    first_refusal = Some((in_words(device, &undecided, &meaning, &reason), says_more));
-                }
+        match codec::resolve(device, *point, &meaning) {
+            Ok(resolved) => match encode(details, &resolved, value) {
+                Ok(_) => return Ok(()),
+                Err(reason) => refusals.push((reason, as_held())),
+            },
+            Err(missing) => {
+                without.push((without_value(device, *point, &meaning, &missing), as_held()));
             }
         }
     }
-    match first_refusal {
-        None => Ok(()),
-        Some((reason, _)) if undecided.is_empty() => Err(reason),
-        Some((reason, _)) => {
-            let deciding: Vec<String> =
-                undecided.iter().map(|selector| format!("`{}`", device.points[*selector].name)).collect();
-            Err(format!(
-                "`{value}` fits nothing that {} may make of `{}`; {reason}",
-                deciding.join(" and "),
-                details.name
-            ))
-        }
+    refusals.append(&mut without);
+    let Some((reason, held)) = refusals.first() else { return Ok(()) };
+    if refusals.iter().all(|(other, _)| other == reason) {
+        return Err(reason.clone());
     }
+    let deciding: Vec<String> =
+        undecided.iter().map(|selector| format!("`{}`", device.points[*selector].name)).collect();
+    Err(format!(
+        "`{value}` fits nothing that {} may make of `{}`; with {held}: {reason}",
+        deciding.join(" and "),
+        details.name
+    ))
 }
 
 /// What the wishes themselves say of the points that decide others.
@@ -203,13 +206,6 @@ fn without_value(device: &Device, point: PointIndex, known: &[Option<i128>], mis
     }
 }
 
-/// `` as `pt100`: `900` is outside -50 to 600 ``
-fn in_words(device: &Device, undecided: &[PointIndex], known: &[Option<i128>], reason: &str) -> String {
-    let held: Vec<String> =
-        undecided.iter().map(|selector| format!("`{}`", held(device, *selector, known))).collect();
-    if held.is_empty() { reason.into() } else { format!("as {}: {reason}", held.join(" and ")) }
-}
-
 /// The name of what a deciding point holds, or its number.
 fn held(device: &Device, point: PointIndex, known: &[Option<i128>]) -> String {
     let Some(raw) = known[point] else { return "unknown".into() };
@@ -259,8 +255,10 @@ mod tests {
         // Nothing says what is connected: there is a sensor for which it is right.
         assert_eq!(check_values(AI8, &[("channel_1_on_above", "60")]), Ok(()));
         let refused = check_values(AI8, &[("channel_1_on_above", "much")]).expect_err("no number at all");
-        assert!(refused.starts_with("`much` fits nothing that `channel_1_code`"), "{refused}");
-        assert!(refused.contains("`much` is not a number"), "{refused}");
+        assert_eq!(refused, "`much` is not a number");
+        let refused = check_values(AI8, &[("channel_1_on_above", "99999999")]).expect_err("nowhere");
+        let expected = "`99999999` fits nothing that `temperature_unit` and `channel_1_code` may make of `channel_1_on_above`; with `°C` and `voltage`: `99999999` is outside";
+        assert!(refused.starts_with(expected), "{refused}");
         // The deciding point stands beside it, in whatever order.
         const SI4: &str = "metz-connect/mr-si4";
         assert_eq!(check_values(SI4, &[("meter_1_start", "12.3"), ("meter_1_decimals", "1")]), Ok(()));
@@ -268,7 +266,7 @@ mod tests {
         assert_eq!(refused, Err("`4294967295` is outside 0 to 429496729.5".into()));
         assert_eq!(check_values(SI4, &[("meter_1_start", "4294967295")]), Ok(()));
         let refused = check_values(SI4, &[("meter_1_start", "4294967296")]).expect_err("too large");
-        assert!(refused.contains("as `0`: `4294967296` is outside 0 to 4294967295"), "{refused}");
+        assert!(refused.contains("with `0`: `4294967296` is outside 0 to 4294967295"), "{refused}");
     }
 
     #[test]

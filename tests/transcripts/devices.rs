@@ -7,12 +7,13 @@ use busker::engine::device::{
 use busker::engine::profile::Library;
 use busker::engine::settings::{
     Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password, Settings,
+    Wanted,
 };
 use busker::engine::time::Duration;
 use busker::engine::value::Decimal;
 
-/// Reads the header: `device …` lines, and `tcp`, `discovery` or `stop feeding`
-/// by themselves.
+/// Reads the header: `device …` lines, `setting DEVICE POINT VALUE` with `enforced` behind it perhaps,
+/// and `tcp`, `discovery` or `stop feeding` by themselves.
 pub fn settings(header: &str) -> Settings {
     let mut devices = Vec::new();
     for line in header.lines() {
@@ -24,7 +25,15 @@ pub fn settings(header: &str) -> Settings {
                 bus: 0,
                 unit: unit.parse().expect("a unit"),
                 device: device(kind),
+                wanted: Vec::new(),
             });
+        }
+        if let ["setting", name, point, value, ref enforced @ ..] = words[..] {
+            let device = devices.iter_mut().find(|device: &&mut DeviceSettings| device.name == name);
+            let device = device.expect("a device of a line before");
+            let point = device.device.points.iter().position(|known| known.name == point).expect("a point");
+            let enforce = matches!(enforced, ["enforced"]);
+            device.wanted.push(Wanted { point, value: value.into(), enforce });
         }
     }
     let says = |wanted: &str| header.lines().any(|line| line == wanted);
@@ -79,6 +88,8 @@ fn device(kind: &str) -> Device {
         }
         "relays" => relays(),
         "selectable" => selectable(),
+        "thresholds" => thresholds(),
+        "input" => input(),
         "identified" => {
             let mut device = with(vec![point("level", register(Table::Input, 0, 1), Poll::Fast), order()]);
             device.identify = Some(Identify::Names { vendor: "ACME".into(), product: "L1".into() });
@@ -143,6 +154,38 @@ fn selectable() -> Device {
         cases: vec![case(0, "current", Some("mA")), case(1, "voltage", Some("V")), case(2, "off", None)],
     };
     with(vec![mode, value])
+}
+
+/// Two settings of which one has to be the smaller; the device sees to that (FuehlerSysteme, chapter 6.1.2).
+fn thresholds() -> Device {
+    let setting = |name: &str, address: u16, other: usize| {
+        let at = register(Table::Holding, address, 1);
+        let mut setting = writable(point(name, at, Poll::Slow), range("0", "9999"));
+        setting.persistent = true;
+        setting.re_read = vec![other];
+        setting
+    };
+    let mut device = with(vec![setting("off_below", 0, 1), setting("on_above", 1, 0)]);
+    device.wire.quirks.clamps_with_exception = true;
+    device
+}
+
+/// What is measured, and a threshold in its unit; both in EEPROM.
+fn input() -> Device {
+    let mut device = selectable();
+    let mut threshold = point("threshold", register(Table::Holding, 20, 1), Poll::Slow);
+    let case = |key, name: &str, unit: &str, most: i128| {
+        let mut form = tenths(unit);
+        form.range = Some((Decimal::ZERO, Decimal::integer(most)));
+        Case { key, name: name.into(), form: Some(form) }
+    };
+    let mut cases = vec![case(0, "current", "mA", 20), case(1, "voltage", "V", 10)];
+    cases.push(Case { key: 2, name: "off".into(), form: None });
+    threshold.encoding = Encoding::Cases { by: 0, cases };
+    let mut threshold = writable(threshold, WriteRule::Any);
+    threshold.persistent = true;
+    device.points.push(threshold);
+    device
 }
 
 /// 0 or 1, or 11111 for "automatic".

@@ -5,6 +5,7 @@ use std::fmt::Write;
 
 use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Action, Bus, Command, Event, Severity};
+use busker::engine::memory::{Memories, Memory, Record};
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
 use busker::engine::time::{Duration, Time};
 
@@ -40,6 +41,9 @@ fn timed(line: &str) -> Option<(Time, &str)> {
 
 struct Player {
     bus: Bus,
+    header: String,
+    /// What has been stored.
+    memories: Memories,
     text: String,
     now: Time,
     in_flight: Option<(Request, Time, Duration)>,
@@ -47,6 +51,8 @@ struct Player {
     registers: BTreeMap<(u8, Table, u16), u16>,
     answering: bool,
     silent: Vec<u8>,
+    /// Holding register 0 is kept below holding register 1.
+    clamps: bool,
     /// While devices answer by themselves, requests are counted instead of written down.
     asked: BTreeMap<String, u32>,
 }
@@ -55,15 +61,19 @@ const LATENCY: Duration = Duration::from_millis(9);
 
 impl Player {
     fn new(header: &str) -> Player {
-        let bus = Bus::new(Time::default(), &devices::settings(header), 0);
+        let memories = Memories::default();
+        let bus = Bus::new(Time::default(), &devices::settings(header), 0, &memories);
         let mut player = Player {
             bus,
+            header: header.to_string(),
+            memories,
             text: header.to_string(),
             now: Time::default(),
             in_flight: None,
             registers: BTreeMap::new(),
             answering: false,
             silent: Vec::new(),
+            clamps: false,
             asked: BTreeMap::new(),
         };
         player.take_actions();
@@ -92,6 +102,11 @@ impl Player {
             }
             "broker-up" => self.bus.handle(self.now, Event::BrokerUp),
             "broker-down" => self.bus.handle(self.now, Event::BrokerDown),
+            "restart" => self.restart(),
+            // From the next restart on.
+            "setting" => self.change_setting(rest),
+            "nothing-is-kept" => self.memories.unkept = Some("the card is full".into()),
+            "clamps" => self.clamps = true,
             "shutdown" => self.bus.handle(self.now, Event::Shutdown),
             "set" | "retained-set" => {
                 let (place, payload) = rest.split_once(' ').expect("set device/point value");
@@ -120,6 +135,23 @@ impl Player {
             _ => panic!("unknown input `{input}`"),
         }
         self.take_actions();
+    }
+
+    fn restart(&mut self) {
+        self.in_flight = None;
+        self.bus = Bus::new(self.now, &devices::settings(&self.header), 0, &self.memories);
+        self.take_actions();
+        self.bus.handle(self.now, Event::LinkUp);
+    }
+
+    /// `relays watchdog 30`, `relays watchdog 30 enforced`
+    fn change_setting(&mut self, setting: &str) {
+        let point: Vec<&str> = setting.split(' ').take(2).collect();
+        let same = format!("setting {} ", point.join(" "));
+        let mut lines: Vec<&str> = self.header.lines().filter(|line| !line.starts_with(&same)).collect();
+        let line = format!("setting {setting}");
+        lines.push(&line);
+        self.header = lines.join("\n");
     }
 
     fn run_until(&mut self, time: Time) {
@@ -162,6 +194,19 @@ impl Player {
                     let retained = if message.retain { "" } else { " (not retained)" };
                     let payload = summary(&message.topic, &message.payload);
                     self.write(&format!("publish {} {payload}{retained}", message.topic));
+                }
+                Action::Store(Record { device, memory }) => {
+                    let Memory { persistent_writes, section, settled, refused, .. } = &memory;
+                    let pairs = |map: &BTreeMap<String, String>| {
+                        map.iter().map(|(name, value)| format!(" {name}={value}")).collect::<String>()
+                    };
+                    self.write(&format!(
+                        "store {device}: {persistent_writes} writes; section{}; settled{}; refused{}",
+                        pairs(section),
+                        pairs(settled),
+                        refused.iter().map(|span| format!(" {span}")).collect::<String>(),
+                    ));
+                    self.memories.devices.insert(device, memory);
                 }
                 Action::Reopen { after } => self.write(&format!("reopen after {} ms", after.as_millis())),
                 Action::Say(severity, text) => {
@@ -216,6 +261,17 @@ impl Player {
             }
             Call::WriteCoil { address, on } => {
                 self.registers.insert((unit, Table::Coil, address), u16::from(on));
+                Answer::Written
+            }
+            // As FuehlerSysteme's boards limit a threshold to the other one, chapter 9.
+            Call::WriteRegister { address, word } if self.clamps && address < 2 => {
+                let at = |address| (unit, Table::Holding, address);
+                let other = self.registers.get(&at(1 - address)).copied().unwrap_or(0);
+                let used = if address == 0 { word.min(other.saturating_sub(1)) } else { word.max(other + 1) };
+                self.registers.insert(at(address), used);
+                if used != word {
+                    return self.reply(sent_at, Err(RequestError::Exception(3)));
+                }
                 Answer::Written
             }
             Call::WriteRegister { address, word } => {
@@ -281,7 +337,14 @@ fn summary(topic: &str, payload: &str) -> String {
     let parse = || -> serde_json::Value { serde_json::from_str(payload).expect("a JSON payload") };
     if topic.ends_with("/info") {
         let info = parse();
-        return format!("online {}, reason {}, missing {}", info["online"], info["reason"], info["missing"]);
+        let drift = match info["drift"].as_array().map(Vec::len) {
+            Some(0) => String::new(),
+            _ => format!(", drift {}", info["drift"]),
+        };
+        return format!(
+            "online {}, reason {}, missing {}{drift}",
+            info["online"], info["reason"], info["missing"]
+        );
     }
     if !topic.starts_with("homeassistant/") {
         return payload.to_string();

@@ -2,6 +2,7 @@
 
 use busker::engine::address::Span;
 use busker::engine::bus::{Action, Bus, Command, Event};
+use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Identification, Reply, Request, RequestError};
 use busker::engine::time::{Duration, Time};
 use proptest::prelude::*;
@@ -9,7 +10,8 @@ use proptest::prelude::*;
 use crate::devices;
 
 const DEVICES: &str = "device relays 1 relays\ndevice meter 2 selectable\ndevice board 3 clamping\n\
-    device holes 4 holes\ndevice cellar 5 identified\ndiscovery\n";
+    device holes 4 holes\ndevice cellar 5 identified\ndiscovery\n\
+    setting relays watchdog 0.02\nsetting relays relay_1_default ON enforced\nsetting meter mode voltage enforced\n";
 const COMMANDS: [(&str, &str, &str); 9] = [
     ("relays", "relay_1", "ON"),
     ("relays", "relay_1_default", "ON"),
@@ -171,7 +173,7 @@ proptest! {
     fn each_command_has_one_outcome_and_one_request_is_in_flight(
         happenings in prop::collection::vec(happening(), 1..300),
     ) {
-        let bus = Bus::new(Time::default(), &devices::settings(DEVICES), 0);
+        let bus = Bus::new(Time::default(), &devices::settings(DEVICES), 0, &Memories::default());
         let mut observed = Observed { bus, now: Time::default(), in_flight: None, outcomes: 0, commands: 0 };
         observed.take_actions();
         observed.play(&Happening::LinkUp);

@@ -14,6 +14,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::{Failure, log};
 use crate::edge::app::App;
+use crate::edge::state_files::StateFiles;
 use crate::engine::configuration;
 use crate::engine::profile::Library;
 use crate::engine::settings::Settings;
@@ -66,7 +67,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let mut mosquitto = Mosquitto::start(args.mqtt)?;
     let settings = settings(&lines, mosquitto.address(), args.http)?;
     let mut screen = Screen::new(&settings, &mosquitto);
-    let app = App::start(settings)?;
+    let app = App::start(settings, StateFiles::nowhere())?;
     let outcome = show(&runtime, &mut stop, &lines, &mut mosquitto, &app, &mut screen);
     app.stop();
     mosquitto.stop();

@@ -9,6 +9,7 @@ use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
 
+use super::device::DeviceState;
 use super::waiting::{Target, Waiting};
 use super::{Bus, Command, Purpose, Severity};
 
@@ -105,7 +106,7 @@ impl Bus {
         let Some(waiting) = self.waiting.take_first(can_begin) else { return false };
         let Waiting { device, target, wanted, .. } = waiting;
         let orders = match target {
-            Target::Point(point) => VecDeque::from([(point, wanted.clone())]),
+            Target::Point(point) | Target::Setting(point) => VecDeque::from([(point, wanted.clone())]),
             Target::Thing(thing) => match self.devices[device].orders(thing, &wanted) {
                 Ok(orders) => orders.into(),
                 Err(reason) => {
@@ -115,6 +116,27 @@ impl Bus {
             },
         };
         self.begin_order(device, target, wanted, orders);
+        true
+    }
+
+    /// Begins to write a setting that a device holds otherwise than it is wanted. Whether anything was
+    /// done. Many settings take their time, in which watchdogs want to be fed: after each, what is due
+    /// comes first.
+    pub(super) fn begin_setting(&mut self) -> bool {
+        if self.active.is_some() || self.wrote_setting {
+            return false;
+        }
+        let next = |(index, device): (usize, &DeviceState)| {
+            let is_settling = |point| {
+                let same = |active: &Active| active.device == index && active.flow.point() == point;
+                self.settling.iter().any(|(_, active)| same(active))
+            };
+            Some((index, device.next_setting(self.now, is_settling)?))
+        };
+        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+        let Some((device, (point, wanted))) = devices.find_map(next) else { return false };
+        let orders = VecDeque::from([(point, wanted.clone())]);
+        self.begin_order(device, Target::Setting(point), wanted, orders);
         true
     }
 
@@ -131,6 +153,7 @@ impl Bus {
         match CommandFlow::begin(state.device(), point, &value, state.known()) {
             (Some(flow), step) => self.take_step(Active { device, target, wanted, flow, orders }, step),
             (None, Step::Finished(outcome)) => {
+                self.setting_ended(device, target, &outcome);
                 self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
                 self.tell_outcome(device, target, of_target(target, wanted, outcome));
             }
@@ -178,11 +201,22 @@ impl Bus {
 
     fn end_command(&mut self, active: Active, outcome: Outcome) {
         let Active { device, target, wanted, flow, .. } = active;
+        self.setting_ended(device, target, &outcome);
         self.devices[device].command_ended(self.now, flow.point(), &outcome, &mut self.context);
         self.tell_outcome(device, target, of_target(target, wanted, outcome));
     }
 
+    fn setting_ended(&mut self, device: usize, target: Target, outcome: &Outcome) {
+        if let Target::Setting(point) = target {
+            self.wrote_setting = true;
+            self.devices[device].setting_ended(self.now, point, outcome);
+        }
+    }
+
     fn tell_outcome(&mut self, device: usize, target: Target, outcome: Outcome) {
+        if matches!(target, Target::Setting(_)) {
+            return;
+        }
         let state = &self.devices[device];
         let topic = self.context.gateway.topics.outcome(state.name(), state.name_of(target));
         self.context.publish(Message::once(topic, outcome.to_json()));
@@ -197,7 +231,7 @@ impl Bus {
 /// A thing's outcome names what was wanted of the thing, and holds what its last point answered.
 fn of_target(target: Target, wanted: String, outcome: Outcome) -> Outcome {
     match target {
-        Target::Point(_) => outcome,
+        Target::Point(_) | Target::Setting(_) => outcome,
         Target::Thing(_) => Outcome { wanted, ..outcome },
     }
 }

@@ -2,6 +2,7 @@
 
 mod beats;
 mod fetching;
+mod keeping;
 mod obeying;
 mod patience;
 mod telling;
@@ -19,11 +20,13 @@ use crate::engine::schedule::{Polls, Urgency};
 use crate::engine::settings::DeviceSettings;
 use crate::engine::state::Values;
 use crate::engine::time::{Duration, Time};
+use crate::engine::upkeep::Upkeep;
 use crate::engine::value::Missing;
 
 use super::waiting::Target;
 use super::{Context, Severity};
 use beats::Beats;
+use keeping::Keeping;
 use patience::{FAILURES_UNTIL_OFFLINE, Patience};
 use wear::Wear;
 
@@ -44,6 +47,8 @@ pub(super) struct DeviceState {
     presence: Presence,
     patience: Patience,
     wear: Wear,
+    upkeep: Upkeep,
+    keeping: Keeping,
     /// How long the request in flight may wait.
     asked_timeout: Duration,
     /// Nothing is asked before.
@@ -96,6 +101,8 @@ impl DeviceState {
             presence: Presence::Absent { reason: "not yet asked".into() },
             patience: Patience::default(),
             wear: Wear::default(),
+            upkeep: Upkeep::default(),
+            keeping: Keeping::default(),
             asked_timeout: Duration::ZERO,
             paused_until: Time::default(),
             served_at: Time::default(),
@@ -304,6 +311,7 @@ impl DeviceState {
         self.values.lose_all(Missing::Offline);
         self.wake_reads();
         self.beats.stop();
+        self.upkeep.forget();
         self.tell_all(now, context);
         self.tell_info(context);
     }
@@ -357,6 +365,7 @@ impl DeviceState {
         let suspects = if code == 2 { read.refused() } else { Vec::new() };
         if !suspects.is_empty() {
             self.refused.extend(suspects);
+            self.keeping.has_changed();
             let reads = plan::plan(&self.settings.device, self.cost, &self.refused);
             let values = &self.values;
             self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
@@ -415,7 +424,8 @@ impl DeviceState {
                 self.announce(context);
             }
             self.publish_availability(true, context);
-            if self.values.take_missing_changed() || !self.told_present {
+            let drift_changed = self.keep_settings(now, context);
+            if self.values.take_missing_changed() || !self.told_present || drift_changed {
                 self.tell_info(context);
             }
         }

@@ -2,7 +2,7 @@
 //!
 //! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
 //! `ask_next` chooses the next: the command that has begun, heartbeats that are late, waiting commands,
-//! heartbeats, what somebody asked for, then whichever device's read (or identification) is most urgent.
+//! heartbeats, what somebody asked for, settings that are not as they are wanted, then whichever device's read (or identification) is most urgent.
 
 mod commands;
 mod device;
@@ -14,6 +14,7 @@ use std::collections::VecDeque;
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
 use crate::engine::homeassistant::Gateway;
+use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Cost;
 use crate::engine::settings::{Link, OnBrokerLoss, Settings};
@@ -70,6 +71,8 @@ pub enum Action {
         timeout: Duration,
     },
     Publish(Message),
+    /// Keep this for the next start.
+    Store(Record),
     /// Close the link, if it is open, and open it after this long. The first action of all.
     Reopen {
         after: Duration,
@@ -101,6 +104,8 @@ pub struct Bus {
     beat: Option<(usize, PointIndex, Call)>,
     /// Points that are read only because somebody asked for them.
     fetches: VecDeque<Fetch>,
+    /// A setting has just been written: what is due to be read comes before the next one.
+    wrote_setting: bool,
     in_flight: Option<InFlight>,
     link_state: LinkState,
     /// Requests in a row that no device on this link answered.
@@ -162,8 +167,9 @@ enum Purpose {
 }
 
 impl Bus {
-    /// The bus number `index` of `settings`, with the devices that are on it.
-    pub fn new(now: Time, settings: &Settings, index: usize) -> Bus {
+    /// The bus number `index` of `settings`, with the devices that are on it and what is remembered
+    /// of them.
+    pub fn new(now: Time, settings: &Settings, index: usize, memories: &Memories) -> Bus {
         let bus = &settings.buses[index];
         let mut context = Context {
             actions: VecDeque::from([Action::Reopen { after: Duration::ZERO }]),
@@ -177,7 +183,9 @@ impl Bus {
         let of_bus = settings.devices.iter().filter(|device| device.bus == index);
         let mut devices: Vec<DeviceState> =
             of_bus.map(|device| DeviceState::new(device.clone(), cost)).collect();
+        let mut counters = Counters::default();
         for device in &mut devices {
+            counters.persistent_writes += device.recall(memories);
             device.introduce(now, &mut context);
         }
         Bus {
@@ -192,11 +200,12 @@ impl Bus {
             settling: Vec::new(),
             beat: None,
             fetches: VecDeque::new(),
+            wrote_setting: false,
             in_flight: None,
             link_state: LinkState::Down { reason: None, attempts: 0 },
             unanswered: 0,
             broker_up: true,
-            counters: Counters::default(),
+            counters,
             load: Load::default(),
             stopping: false,
             now,
@@ -223,6 +232,7 @@ impl Bus {
         } else {
             self.ask_next();
         }
+        self.remember();
     }
 
     /// Takes the next thing to do, until there is none.
@@ -233,20 +243,23 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
+        let records = self.devices.iter().filter_map(DeviceState::record_due_at);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
-            return self.waiting.next_deadline();
+            return records.chain(self.waiting.next_deadline()).min();
         }
         let of_devices =
             self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
         let spared =
             self.waiting.iter().map(|waiting| self.devices[waiting.device].writable_at(waiting.target));
+        let settings = self.devices.iter().filter_map(DeviceState::next_setting_at);
         let beats =
             self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::beats_at);
         of_devices
             .chain(self.waiting.next_deadline())
-            .chain(spared.filter(|at| *at > self.now))
+            .chain(spared.chain(settings).filter(|at| *at > self.now))
             .chain(self.settled_at())
             .chain(beats)
+            .chain(records)
             .min()
     }
 
@@ -364,7 +377,7 @@ impl Bus {
             }
             Some((device, Target::Point(point))) => self.devices[device].want(point),
             Some((device, Target::Thing(thing))) => self.devices[device].want_thing(thing),
-            None => {}
+            Some((_, Target::Setting(_))) | None => {}
         }
     }
 
@@ -381,7 +394,12 @@ impl Bus {
                 self.send(device, call, Purpose::BeatWrite(point));
                 continue;
             }
-            if self.begin_beat(true) || self.begin_command() || self.begin_beat(false) || self.next_fetch() {
+            if self.begin_beat(true)
+                || self.begin_command()
+                || self.begin_beat(false)
+                || self.next_fetch()
+                || self.begin_setting()
+            {
                 continue;
             }
             let now = self.now;
@@ -394,7 +412,14 @@ impl Bus {
                 let better = other.2 > best.2 || (other.2 == best.2 && other.3 < best.3);
                 if better { other } else { best }
             });
-            let Some((device, polled, ..)) = next else { return };
+            let read_before_setting = std::mem::take(&mut self.wrote_setting);
+            let Some((device, polled, ..)) = next else {
+                // Nothing is due: the next setting need not wait for it.
+                if read_before_setting {
+                    continue;
+                }
+                return;
+            };
             let (call, purpose) = match polled {
                 Polled::Identification(call) => (call, Purpose::Identify),
                 Polled::Read(read, call) => (call, Purpose::Poll { read }),
@@ -417,6 +442,14 @@ impl Bus {
     /// A device whose watchdog must run out is not spoken to while the broker is away.
     fn may_ask(&self, device: &DeviceState) -> bool {
         self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog()
+    }
+
+    fn remember(&mut self) {
+        for device in &mut self.devices {
+            if let Some(record) = device.record(self.now, self.stopping) {
+                self.context.actions.push_back(Action::Store(record));
+            }
+        }
     }
 
     fn send(&mut self, device: usize, call: Call, purpose: Purpose) {

@@ -9,6 +9,8 @@ pub enum Target {
     Point(PointIndex),
     /// An index into the device's things.
     Thing(usize),
+    /// A point whose setting is not as it is wanted; nobody waits for the outcome.
+    Setting(PointIndex),
 }
 
 /// A command that has not begun.

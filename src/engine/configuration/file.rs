@@ -166,7 +166,8 @@ impl Read for Setting {
 pub struct SettingValue(pub String);
 
 impl Scalar for SettingValue {
-    const EXPECTED: &'static str = "a value like `30s`, `21.5` or `ON`, or a map like `{value: 30s, enforce: true}`";
+    const EXPECTED: &'static str =
+        "a value like `30s`, `21.5` or `ON`, or a map like `{value: 30s, enforce: true}`";
 
     fn parse(text: &str) -> Result<SettingValue, String> {
         Ok(SettingValue(text.into()))

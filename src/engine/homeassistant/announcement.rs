@@ -233,7 +233,14 @@ mod tests {
             cases: vec![case(0, "pt100", form("°C")), case(1, "voltage", form("V")), case(2, "off", None)],
         };
         let device = device_of(vec![relay, mode, input]);
-        DeviceSettings { name: "heating".into(), title: "Heating".into(), bus: 0, unit: 1, device, wanted: Vec::new() }
+        DeviceSettings {
+            name: "heating".into(),
+            title: "Heating".into(),
+            bus: 0,
+            unit: 1,
+            device,
+            wanted: Vec::new(),
+        }
     }
 
     fn announced(mode: Option<i128>) -> Announcement {

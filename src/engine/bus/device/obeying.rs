@@ -16,14 +16,14 @@ impl DeviceState {
 
     pub(in crate::engine::bus) fn name_of(&self, target: Target) -> &str {
         match target {
-            Target::Point(point) => &self.settings.device.points[point].name,
+            Target::Point(point) | Target::Setting(point) => &self.settings.device.points[point].name,
             Target::Thing(thing) => &self.settings.device.things[thing].name,
         }
     }
 
     pub(in crate::engine::bus) fn is_press(&self, target: Target) -> bool {
         match target {
-            Target::Point(point) => self.details(point).is_button(),
+            Target::Point(point) | Target::Setting(point) => self.details(point).is_button(),
             Target::Thing(thing) => self.settings.device.things[thing].states.is_empty(),
         }
     }
@@ -31,7 +31,7 @@ impl DeviceState {
     /// The points that a command to `target` may write.
     pub(in crate::engine::bus) fn written_by(&self, target: Target) -> Vec<PointIndex> {
         match target {
-            Target::Point(point) => vec![point],
+            Target::Point(point) | Target::Setting(point) => vec![point],
             Target::Thing(thing) => {
                 let commands = &self.settings.device.things[thing].commands;
                 commands.iter().flat_map(|command| &command.orders).map(|(point, _)| *point).collect()
@@ -71,7 +71,7 @@ impl DeviceState {
     fn unknown_selector(&self, target: Target) -> Option<PointIndex> {
         let of_points = self.written_by(target).into_iter().flat_map(|point| self.details(point).selectors());
         let of_thing = match target {
-            Target::Point(_) => None,
+            Target::Point(_) | Target::Setting(_) => None,
             Target::Thing(thing) => Some(self.settings.device.things[thing].when.iter()),
         };
         let of_thing = of_thing.into_iter().flatten().map(|condition| condition.point);
@@ -114,6 +114,7 @@ impl DeviceState {
         self.counters.writes += 1;
         if self.details(point).persistent {
             self.counters.persistent_writes += 1;
+            self.keeping.has_changed();
             self.wear.spend(now, point);
         }
         if self.values.is_selector(point) {

@@ -136,6 +136,19 @@ impl DeviceState {
                 _ => None,
             })
             .collect();
+        let drift: Vec<serde_json::Value> = self
+            .upkeep
+            .drift()
+            .into_iter()
+            .map(|drift| {
+                json!({
+                    "point": drift.point,
+                    "wanted": drift.wanted,
+                    "found": drift.found,
+                    "reason": drift.reason,
+                })
+            })
+            .collect();
         let info = json!({
             "profile": self.settings.device.profile,
             "manufacturer": self.settings.device.manufacturer,
@@ -146,6 +159,7 @@ impl DeviceState {
             "online": self.presence == Presence::Present,
             "reason": self.reason(),
             "missing": missing,
+            "drift": drift,
         })
         .to_string();
         self.told_present = self.presence == Presence::Present;

@@ -1,0 +1,292 @@
+//! The files in `state_dir`: one small file for each device, read at the start and replaced as a whole.
+//!
+//! Storing is a thread of its own: a memory card may take seconds to say that it has what it was
+//! given, and a bus waits for nobody.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, ErrorKind, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+use anyhow::Context;
+
+use crate::engine::memory::{Memories, Memory, Record};
+use crate::engine::time::Duration;
+
+/// What could not be stored is tried again after this.
+const TRY_AGAIN_AFTER: Duration = Duration::from_secs(60);
+
+/// What was remembered at the start, and where to put what is to be remembered.
+pub struct StateFiles {
+    memories: Memories,
+    desk: Arc<Desk>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+    keeps: bool,
+}
+
+/// What lies on it waits to be stored: the newest of each device.
+#[derive(Default)]
+struct Desk {
+    waiting: Mutex<Waiting>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct Waiting {
+    memories: BTreeMap<String, Memory>,
+    finish: bool,
+}
+
+impl StateFiles {
+    /// Keeps nothing, and remembers nothing.
+    pub fn nowhere() -> StateFiles {
+        let memories = Memories { unkept: Some("nothing is kept".into()), ..Memories::default() };
+        StateFiles { memories, desk: Arc::default(), thread: Mutex::default(), keeps: false }
+    }
+
+    /// Reads what is remembered of these devices in `state_dir`. What is wrong with the files goes to
+    /// the log, and the gateway runs without them.
+    pub fn open<'d>(state_dir: &Path, devices: impl Iterator<Item = &'d str>) -> anyhow::Result<StateFiles> {
+        let folder = state_dir.join("devices");
+        let mut memories = Memories::default();
+        let mut unknown = Vec::new();
+        for device in devices {
+            match recall(&file_of(&folder, device)) {
+                Ok(Some(memory)) => drop(memories.devices.insert(device.into(), memory)),
+                Ok(None) => unknown.push(device),
+                Err(reason) => memories.unkept = Some(reason),
+            }
+        }
+        let shown = folder.display();
+        if !unknown.is_empty() {
+            tracing::info!("nothing is remembered yet in `{shown}` of {}", unknown.join(", "));
+        }
+        if memories.unkept.is_none() {
+            memories.unkept =
+                probe(&folder).err().map(|error| format!("`{shown}` cannot be written: {error}"));
+        }
+        if let Some(reason) = &memories.unkept {
+            tracing::warn!(
+                "{reason}; counts of EEPROM writes end with this run, and `settings` are only compared, \
+                 except where they are enforced"
+            );
+            return Ok(StateFiles { memories, desk: Arc::default(), thread: Mutex::default(), keeps: false });
+        }
+        let desk = Arc::<Desk>::default();
+        let of_thread = desk.clone();
+        let thread = std::thread::Builder::new()
+            .name("state-files".into())
+            .spawn(move || of_thread.work(&folder))
+            .context("no thread can be started")?;
+        Ok(StateFiles { memories, desk, thread: Mutex::new(Some(thread)), keeps: true })
+    }
+
+    pub fn memories(&self) -> &Memories {
+        &self.memories
+    }
+
+    /// Puts a memory where it will be stored. Does not wait for that.
+    pub fn store(&self, record: Record) {
+        if self.keeps {
+            self.desk.lock().memories.insert(record.device, record.memory);
+            self.desk.changed.notify_all();
+        }
+    }
+
+    /// Waits until everything is stored; the end.
+    pub fn finish(&self) {
+        self.desk.lock().finish = true;
+        self.desk.changed.notify_all();
+        let thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if thread.is_some_and(|thread| thread.join().is_err()) {
+            tracing::error!("the thread that stores the state ended in a panic");
+        }
+    }
+}
+
+impl Drop for StateFiles {
+    fn drop(&mut self) {
+        self.finish();
+    }
+}
+
+impl Desk {
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn work(&self, folder: &Path) {
+        let mut failed = false;
+        loop {
+            let (memories, finish) = self.take(failed);
+            for (device, memory) in memories {
+                match replace(&file_of(folder, &device), &memory.to_text()) {
+                    Ok(()) if failed => {
+                        failed = false;
+                        tracing::info!("`{}` can be written again", folder.display());
+                    }
+                    Ok(()) => {}
+                    Err(error) if finish => {
+                        tracing::error!("the state of {device} is lost, since it cannot be stored: {error}");
+                    }
+                    Err(error) => {
+                        if !failed {
+                            let path = file_of(folder, &device);
+                            tracing::warn!("`{}` cannot be stored: {error}", path.display());
+                        }
+                        failed = true;
+                        // What has come meanwhile is newer.
+                        self.lock().memories.entry(device).or_insert(memory);
+                    }
+                }
+            }
+            if finish {
+                return;
+            }
+        }
+    }
+
+    /// Waits for something to store, or for the end. After a failure, what waits may wait.
+    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, bool) {
+        let mut waiting = self.lock();
+        if failed && !waiting.finish {
+            let until_finish = |waiting: &mut Waiting| !waiting.finish;
+            let waited = self.changed.wait_timeout_while(waiting, TRY_AGAIN_AFTER, until_finish);
+            waiting = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        let nothing_to_do = |waiting: &mut Waiting| waiting.memories.is_empty() && !waiting.finish;
+        let mut waiting =
+            self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
+        (std::mem::take(&mut waiting.memories), waiting.finish)
+    }
+}
+
+fn file_of(folder: &Path, device: &str) -> PathBuf {
+    folder.join(format!("{device}.json"))
+}
+
+/// What the file says; `None` if there is none, or none that can be understood: that one is kept
+/// aside. `Err` if it cannot even be kept aside, and must not be overwritten.
+fn recall(path: &Path) -> Result<Option<Memory>, String> {
+    let read = match fs::read_to_string(path) {
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+            return Ok(None);
+        }
+        Err(error) => Err(error.to_string()),
+        Ok(text) => Memory::parse(&text),
+    };
+    let reason = match read {
+        Ok(memory) => return Ok(Some(memory)),
+        Err(reason) => reason,
+    };
+    let shown = path.display();
+    match keep_aside(path) {
+        Ok(aside) => {
+            tracing::warn!(
+                "`{shown}` cannot be used ({reason}) and is kept as `{}`; everything in it counts as never done, \
+                 as at the first start",
+                aside.display()
+            );
+            Ok(None)
+        }
+        Err(error) => Err(format!("`{shown}` cannot be used ({reason}) and cannot be kept aside ({error})")),
+    }
+}
+
+/// Renames a damaged file to one with `.broken` behind its name, which replaces no other.
+fn keep_aside(path: &Path) -> io::Result<PathBuf> {
+    let numbered = (2..=99).map(|number| format!(".broken.{number}"));
+    for ending in std::iter::once(".broken".to_string()).chain(numbered) {
+        let mut name = path.as_os_str().to_owned();
+        name.push(ending);
+        let aside = PathBuf::from(name);
+        if !aside.exists() {
+            fs::rename(path, &aside)?;
+            return Ok(aside);
+        }
+    }
+    Err(io::Error::other("there are 99 damaged ones already"))
+}
+
+/// Whether files can be made in `folder`, which is made if it is not there.
+fn probe(folder: &Path) -> io::Result<()> {
+    fs::create_dir_all(folder)?;
+    let path = folder.join(".probe");
+    File::create(&path)?;
+    fs::remove_file(&path)
+}
+
+/// Puts `text` in place of the file: whoever looks, and whenever the power fails, it is there whole, old
+/// or new.
+fn replace(path: &Path, text: &str) -> io::Result<()> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let temporary = path.with_extension("json.new");
+    let mut file = File::create(&temporary)?;
+    file.write_all(text.as_bytes())?;
+    file.sync_all()?;
+    fs::rename(&temporary, path)?;
+    File::open(folder)?.sync_all()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn memory(writes: u64) -> Memory {
+        Memory { persistent_writes: writes, ..Memory::default() }
+    }
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = fs::read_dir(folder).expect("a folder");
+        let mut names: Vec<String> =
+            entries.map(|entry| entry.expect("an entry").file_name().to_string_lossy().into()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn what_is_stored_is_there_after_a_restart_and_only_the_newest() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let files = StateFiles::open(folder.path(), ["one", "two"].into_iter()).expect("a thread");
+        assert_eq!(files.memories(), &Memories::default());
+        for writes in 1..=100 {
+            files.store(Record { device: "one".into(), memory: memory(writes) });
+        }
+        drop(files);
+        let files = StateFiles::open(folder.path(), ["one", "two"].into_iter()).expect("a thread");
+        assert_eq!(files.memories().devices, BTreeMap::from([("one".to_string(), memory(100))]));
+        assert_eq!(files.memories().unkept, None);
+        drop(files);
+        assert_eq!(names(&folder.path().join("devices")), ["one.json"]);
+    }
+
+    #[test]
+    fn a_damaged_file_is_kept_aside_and_replaces_no_other() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let devices = folder.path().join("devices");
+        for (round, content) in ["{\"version\": 1, \"pl", "second"].into_iter().enumerate() {
+            fs::create_dir_all(&devices).expect("a folder");
+            fs::write(devices.join("one.json"), content).expect("a file");
+            let files = StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
+            assert_eq!(files.memories(), &Memories::default(), "round {round}");
+            drop(files);
+        }
+        assert_eq!(names(&devices), ["one.json.broken", "one.json.broken.2"]);
+        let first = fs::read_to_string(devices.join("one.json.broken")).expect("the first one");
+        assert_eq!(first, "{\"version\": 1, \"pl");
+    }
+
+    #[test]
+    fn without_a_place_to_write_it_runs_and_says_so() {
+        let folder = tempfile::tempdir().expect("a folder");
+        // A file where the folder should be: nobody can write there, root neither.
+        let in_the_way = folder.path().join("state");
+        fs::write(&in_the_way, "").expect("a file");
+        let files = StateFiles::open(&in_the_way, ["one"].into_iter()).expect("no thread is needed");
+        let reason = files.memories().unkept.clone().expect("a reason");
+        assert!(reason.contains("cannot be written"), "{reason}");
+        files.store(Record { device: "one".into(), memory: memory(1) });
+    }
+}

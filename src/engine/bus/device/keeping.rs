@@ -1,0 +1,121 @@
+//! What a device keeps for its owner: settings as they are wanted, and what outlives a restart.
+
+use crate::engine::command::Outcome;
+use crate::engine::device::PointIndex;
+use crate::engine::memory::{self, Memories, Memory, Record};
+use crate::engine::plan;
+use crate::engine::time::{Duration, Time};
+use crate::engine::upkeep::Upkeep;
+
+use super::{Context, DeviceState};
+use crate::engine::bus::Severity;
+use crate::engine::bus::waiting::Target;
+
+/// A device's memory is stored no more often than this, whatever is written to the device: it may lie
+/// on a memory card.
+const STORE_INTERVAL: Duration = Duration::from_secs(10);
+/// That a setting has been seen to is stored so soon: a restart right after it must not write again.
+const STORE_SETTLED_AFTER: Duration = Duration::from_secs(1);
+
+/// What is stored of a device, and when next.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Keeping {
+    /// The fingerprint of the plan without refusals.
+    plan: String,
+    stored: Memory,
+    changed: bool,
+    not_before: Time,
+}
+
+impl Keeping {
+    /// Something that is remembered has changed.
+    pub(super) fn has_changed(&mut self) {
+        self.changed = true;
+    }
+}
+
+impl DeviceState {
+    /// Goes on from what is remembered of the device; returns how often its EEPROM has been written.
+    pub(in crate::engine::bus) fn recall(&mut self, memories: &Memories) -> u64 {
+        let device = &self.settings.device;
+        let reads = plan::plan(device, self.cost, &[]);
+        let memory = memories.devices.get(&self.settings.name).cloned().unwrap_or_default();
+        self.keeping.plan = memory::fingerprint(device, &reads);
+        self.counters.persistent_writes = memory.persistent_writes;
+        // Another profile asks otherwise, and is refused otherwise.
+        if memory.plan == self.keeping.plan {
+            self.refused = memory.refused.clone();
+            let reads = plan::plan(device, self.cost, &self.refused);
+            let values = &self.values;
+            self.polls.replace(reads, device.wire.intervals, |point| values.is_selector(point));
+        }
+        self.upkeep = Upkeep::new(&self.settings.device, &self.settings.wanted, &memory);
+        match &memories.unkept {
+            Some(reason) => self.upkeep.write_nothing(reason),
+            None => self.keeping.changed = true,
+        }
+        self.keeping.stored = memory;
+        self.counters.persistent_writes
+    }
+
+    fn memory(&self) -> Memory {
+        Memory {
+            plan: if self.refused.is_empty() { String::new() } else { self.keeping.plan.clone() },
+            refused: self.refused.clone(),
+            persistent_writes: self.counters.persistent_writes,
+            section: self.upkeep.section().clone(),
+            settled: self.upkeep.settled(),
+        }
+    }
+
+    /// What is to be stored now; `at_once` at the end, when there is no later.
+    pub(in crate::engine::bus) fn record(&mut self, now: Time, at_once: bool) -> Option<Record> {
+        if !self.keeping.changed || (now < self.keeping.not_before && !at_once) {
+            return None;
+        }
+        self.keeping.changed = false;
+        let memory = self.memory();
+        if memory == self.keeping.stored {
+            return None;
+        }
+        self.keeping.not_before = now + STORE_INTERVAL;
+        self.keeping.stored = memory.clone();
+        Some(Record { device: self.settings.name.clone(), memory })
+    }
+
+    pub(in crate::engine::bus) fn record_due_at(&self) -> Option<Time> {
+        self.keeping.changed.then_some(self.keeping.not_before)
+    }
+
+    /// Compares the settings with what the device holds. Whether what is told of them has changed.
+    pub(super) fn keep_settings(&mut self, now: Time, context: &mut Context) -> bool {
+        self.upkeep.compare(now, &self.settings.device, &self.values);
+        for note in self.upkeep.take_notes() {
+            let severity = if note.is_warning { Severity::Warning } else { Severity::Info };
+            context.say(severity, format!("device {}: {}", self.settings.name, note.text));
+        }
+        if self.upkeep.take_settled_changed() {
+            self.keeping.changed = true;
+            self.keeping.not_before = self.keeping.not_before.min(now + STORE_SETTLED_AFTER);
+        }
+        self.upkeep.take_drift_changed()
+    }
+
+    /// The setting that is to be written next, and the command for it.
+    pub(in crate::engine::bus) fn next_setting(
+        &self,
+        now: Time,
+        is_settling: impl Fn(PointIndex) -> bool,
+    ) -> Option<(PointIndex, String)> {
+        self.upkeep.next(|point| !is_settling(point) && self.can_take(now, Target::Setting(point)))
+    }
+
+    /// From when on the next setting may be written, for its EEPROM's sake.
+    pub(in crate::engine::bus) fn next_setting_at(&self) -> Option<Time> {
+        self.upkeep.pending().map(|point| self.writable_at(Target::Setting(point))).min()
+    }
+
+    pub(in crate::engine::bus) fn setting_ended(&mut self, now: Time, point: PointIndex, outcome: &Outcome) {
+        self.upkeep.ended(now, point, outcome);
+    }
+}
