@@ -6,11 +6,11 @@
 //! is wrong that nothing which the other point may hold would make right.
 
 use crate::engine::codec::{self, Raw, Resolved};
-use crate::engine::device::{Category, Device, Encoding, Names, Point, PointIndex, WriteRule};
+use crate::engine::device::{Category, Device, Encoding, Kind, Names, Point, PointIndex, WriteRule};
 use crate::engine::settings::Wanted;
 use crate::engine::time::Duration;
 use crate::engine::value::{Decimal, Missing};
-use crate::engine::yaml::Scalar;
+use crate::engine::yaml::{Scalar, list_of_choices};
 
 /// Why this point cannot be a setting; `None` if it can.
 pub fn refusal(point: &Point) -> Option<String> {
@@ -44,7 +44,11 @@ pub fn settings(device: &Device) -> impl Iterator<Item = PointIndex> {
 /// The words that make `text` true, as [`codec::encode`], or the rule that it breaks.
 pub fn encode(point: &Point, resolved: &Resolved<'_>, text: &str) -> Result<Vec<u16>, String> {
     let write = point.write.as_ref().ok_or_else(|| format!("`{}` is read-only", point.name))?;
-    codec::encode(point, &write.rule, resolved, &as_command(resolved, text)?)
+    let command = as_command(resolved, text)?;
+    codec::encode(point, &write.rule, resolved, &command).map_err(|reason| match &resolved.unit {
+        Some(unit) if command != text => format!("`{text}` is {command} {unit}; {reason}"),
+        _ => reason,
+    })
 }
 
 /// The wanted text as a command says it: a duration as a number in the point's unit.
@@ -90,6 +94,9 @@ fn in_unit(duration: Duration, micros_each: i128) -> Option<String> {
 pub fn check(device: &Device, wanted: &[Wanted], index: usize) -> Result<(), String> {
     let Wanted { point, value, .. } = &wanted[index];
     let details = &device.points[*point];
+    if let Some(reason) = unknown_name(details, value) {
+        return Err(reason);
+    }
     let known = known_by(device, wanted);
     let undecided: Vec<PointIndex> =
         details.selectors().into_iter().filter(|selector| known[*selector].is_none()).collect();
@@ -124,6 +131,18 @@ pub fn check(device: &Device, wanted: &[Wanted], index: usize) -> Result<(), Str
         deciding.join(" and "),
         details.name
     ))
+}
+
+/// What is wrong with a name that the point does not have; there may be dozens.
+fn unknown_name(point: &Point, value: &str) -> Option<String> {
+    let form = point.plain().filter(|form| matches!(form.names, Names::All(_)) && form.kind != Kind::Bool)?;
+    let write = point.write.as_ref()?;
+    let names: Vec<&str> = match &write.rule {
+        WriteRule::Names(names) => names.iter().map(String::as_str).collect(),
+        _ => form.names.list().iter().map(|(_, name)| name.as_str()).collect(),
+    };
+    (!names.contains(&value))
+        .then(|| format!("`{value}` is no value of `{}`; {}", point.name, list_of_choices(value, &names)))
 }
 
 /// What the wishes themselves say of the points that decide others.
@@ -238,7 +257,7 @@ mod tests {
             ("1.5m", Ok(())),
             ("0.25s", Ok(())),
             ("10m55s", Err("`m55s` is not a unit of time; expected us, ms, s, m, h or d, as in `30s`")),
-            ("700s", Err("`700` is outside 0 to 655.35")),
+            ("700s", Err("`700s` is 700 s; `700` is outside 0 to 655.35")),
             ("soon", Err("`soon` is not a number")),
         ] {
             let found = check_values("metz-connect/mr-do4", &[("watchdog", text)]);
@@ -260,7 +279,7 @@ mod tests {
         const SI4: &str = "metz-connect/mr-si4";
         assert_eq!(check_values(SI4, &[("meter_1_start", "12.3"), ("meter_1_decimals", "1")]), Ok(()));
         let refused = check_values(SI4, &[("meter_1_start", "4294967295"), ("meter_1_decimals", "1")]);
-        assert_eq!(refused, Err("`4294967295` is outside 0 to 429496729.5".into()));
+        assert_eq!(refused, Err("`4294967295` is outside 0.0 to 429496729.5".into()));
         assert_eq!(check_values(SI4, &[("meter_1_start", "4294967295")]), Ok(()));
         let refused = check_values(SI4, &[("meter_1_start", "4294967296")]).expect_err("too large");
         assert_eq!(
