@@ -10,13 +10,15 @@ use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::Link;
 use crate::engine::address::Span;
 use crate::engine::codec::{self, Raw};
-use crate::engine::command::words_of;
+use crate::engine::command::{CommandFlow, Outcome, Step, words_of};
 use crate::engine::device::{Device, PointIndex};
+use crate::engine::identity;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
+use crate::engine::profile::Library;
 use crate::engine::settings::{self, Line, Parity};
 use crate::engine::time::Duration;
-use crate::engine::yaml::Scalar;
+use crate::engine::yaml::{Scalar, nearest};
 
 /// Where the device is: for a verb's own arguments by `#[command(flatten)]`.
 #[derive(Debug, clap::Args)]
@@ -26,6 +28,10 @@ pub struct ByHand {
     /// The device's name in the configuration
     #[arg(long, value_name = "NAME", requires = "config")]
     device: Option<String>,
+    /// Its profile, as `busker profiles list` tells them, or a file of one that ends in .yaml; with it
+    /// points are known by their names
+    #[arg(long, value_name = "ID", conflicts_with = "config")]
+    profile: Option<String>,
     /// The device's unit on the line; 0 writes to all units of an RTU line
     #[arg(long, value_name = "UNIT", conflicts_with = "config")]
     unit: Option<u8>,
@@ -103,7 +109,9 @@ impl ByHand {
         if !matches!(link, settings::Link::Tcp { .. }) && unit > 247 {
             return Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")));
         }
-        open(&link, None, unit, self.timeout, None)
+        let device = self.profile.as_deref().map(profile).transpose()?;
+        let demanded = device.as_ref().and_then(|device| device.wire.response_timeout);
+        open(&link, None, unit, demanded.unwrap_or_default().max(self.timeout), device)
     }
 
     fn open_configured(&self) -> Result<Asked, Failure> {
@@ -122,6 +130,23 @@ impl ByHand {
         let timeout = device.device.wire.response_timeout.unwrap_or_default().max(bus.response_timeout);
         open(&bus.link, bus.gap, device.unit, timeout, Some(device.device.clone()))
     }
+}
+
+/// The device of a shipped profile, or of a file.
+fn profile(id: &str) -> Result<Device, Failure> {
+    let library = Library::shipped();
+    if id.ends_with(".yaml") {
+        let bytes = std::fs::read(id).with_context(|| format!("cannot read the profile `{id}`"));
+        return library.check(id, &bytes.map_err(Failure::WrongInput)?).map_err(configuration::faults);
+    }
+    if !library.contains(id) {
+        let remedy = match nearest(id, &library.ids()) {
+            Some(meant) => format!("did you mean `{meant}`?"),
+            None => "`busker profiles list` lists them".into(),
+        };
+        return Err(Failure::wrong(format!("unknown profile `{id}`; {remedy}")));
+    }
+    library.load(id).map_err(configuration::faults)
 }
 
 fn open(
@@ -174,6 +199,47 @@ impl Asked {
         }
     }
 
+    /// What the device says of itself, if it is the one of its profile. Without anything to identify it by
+    /// there is nothing to say.
+    pub fn identify(&mut self, device: &Device) -> Result<Option<String>, Failure> {
+        let Some(identify) = &device.identify else { return Ok(None) };
+        let unit = self.unit;
+        let answer = match self.ask(&identity::question(identify))? {
+            Ok(answer) => answer,
+            Err(error) => {
+                return Err(anyhow!("{error}")
+                    .context(format!("unit {unit}: it does not identify itself"))
+                    .into());
+            }
+        };
+        identity::check(identify, &answer)
+            .map(Some)
+            .map_err(|found| anyhow!("unit {unit} is no {}: {found}", device.profile).into())
+    }
+
+    /// Takes every step of a command that has begun with `step`.
+    pub fn carry_out(
+        &mut self,
+        device: &Device,
+        mut flow: CommandFlow,
+        mut step: Step,
+        known: &[Option<i128>],
+    ) -> Result<Outcome, Failure> {
+        loop {
+            step = match step {
+                Step::Finished(outcome) => return Ok(outcome),
+                Step::Ask(call) => {
+                    let result = self.ask(&call)?;
+                    flow.answered(device, known, &result)
+                }
+                Step::Settle(time) => {
+                    std::thread::sleep(time);
+                    Step::Ask(flow.settled(device))
+                }
+            };
+        }
+    }
+
     /// The words (a bit is 0 or 1) of `span`.
     pub fn read(&mut self, span: Span) -> Result<Vec<u16>, Failure> {
         let answer = self.ask(&Call::Read(span))?;
@@ -185,7 +251,7 @@ impl Asked {
     pub fn point(&self, name: &str) -> Result<PointIndex, Failure> {
         let Some(device) = &self.device else {
             return Err(Failure::wrong(format!(
-                "`{name}` is no address; expected one like `holding 0..3`, or a point's name with --config and --device"
+                "`{name}` is no address; expected one like `holding 0..3`, or a point's name with --config and --device, or with --profile"
             )));
         };
         device.points.iter().position(|point| point.name == name).ok_or_else(|| {

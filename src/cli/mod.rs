@@ -22,6 +22,7 @@ mod plan;
 mod profiles;
 mod read;
 mod run;
+mod settings;
 mod simulate;
 mod write;
 
@@ -52,6 +53,7 @@ verbs! {
     profiles Profiles,
     read Read,
     run Run,
+    settings Settings,
     simulate Simulate,
     write Write,
 }

@@ -13,7 +13,7 @@ use crate::engine::value::Reading;
 ///
 /// Shows every register in every interpretation: hexadecimal, with and without sign, as bits, as
 /// text, and each pair of registers as 32-bit numbers in the four orders of bytes. With --config and
-/// --device a point's name is understood as well.
+/// --device, or with --profile, a point's name is understood as well.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   busker read --serial /dev/ttyUSB0 --baud 19200 --parity even --unit 18 'holding 0..3'

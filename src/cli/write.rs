@@ -13,8 +13,8 @@ use crate::engine::modbus::{Answer, Call, RequestError};
 /// Write to one device by hand, and read back what it holds then
 ///
 /// Words are written as they are: decimal, negative or 0x…; coils as ON or OFF. --type and --order
-/// write one value into two registers. With --config and --device a point's name is written by the
-/// rules of its profile. Ends with 1 if the device holds something else afterwards.
+/// write one value into two registers. With --config and --device, or with --profile, a point's
+/// name is written by the rules of its profile. Ends with 1 if the device holds something else afterwards.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   busker write --serial /dev/ttyUSB0 --baud 19200 --parity even --unit 18 'coil 0' ON
@@ -62,7 +62,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     if let Some(profile) = &device.device {
         // The profile's rules are by point, and a bare register would go round them.
         return Err(Failure::wrong(format!(
-            "with --device only points are written, by the rules of {}; `busker profiles show {0}` lists them",
+            "with a profile only points are written, by the rules of {}; `busker profiles show {0}` lists them",
             profile.profile
         )));
     }
@@ -114,25 +114,10 @@ fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
     }
     let mut known = vec![None; device.points.len()];
     asked.learn(&device, index, &mut known)?;
-    let (flow, mut step) = CommandFlow::begin(&device, index, wanted, &known);
-    let Some(mut flow) = flow else {
-        return match step {
-            Step::Finished(outcome) => Err(Failure::wrong(outcome.reason.unwrap_or_default())),
-            Step::Ask(_) | Step::Settle(_) => Ok(()),
-        };
-    };
-    let outcome = loop {
-        match step {
-            Step::Finished(outcome) => break outcome,
-            Step::Ask(call) => {
-                let result = asked.ask(&call)?;
-                step = flow.answered(&device, &known, &result);
-            }
-            Step::Settle(time) => {
-                std::thread::sleep(time);
-                step = Step::Ask(flow.settled(&device));
-            }
-        }
+    let outcome = match CommandFlow::begin(&device, index, wanted, &known) {
+        (Some(flow), step) => asked.carry_out(&device, flow, step, &known)?,
+        (None, Step::Finished(outcome)) => return Err(Failure::wrong(outcome.reason.unwrap_or_default())),
+        (None, Step::Ask(_) | Step::Settle(_)) => return Ok(()),
     };
     let mut line = vec![args.place.clone(), outcome.kind.name().to_owned()];
     line.extend(outcome.found.map(|found| format!("the device holds {found}")));

@@ -24,7 +24,8 @@ pub mod modbus;
 pub mod plan;
 pub mod schedule;
 
-// Understand: what is known of a device, and what changed.
+// Understand: who answers, what is known of it, and what changed.
+pub mod identity;
 pub mod state;
 
 // Tell: topics, discovery, health, and what waits for the broker.

@@ -10,7 +10,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
     &["time", "value", "address"],
     &["yaml", "device", "test_device", "codec", "units", "settings", "wanted", "profile", "configuration"],
     &["modbus", "plan", "schedule"],
-    &["state"],
+    &["identity", "state"],
     &["topics", "health", "homeassistant", "outbox"],
     &["command", "memory", "upkeep", "bus"],
 ];

@@ -11,9 +11,10 @@ mod wear;
 use crate::engine::address::Span;
 use crate::engine::codec;
 use crate::engine::command::words_of;
-use crate::engine::device::{Device, Identify, Point, PointIndex};
+use crate::engine::device::{Device, Point, PointIndex};
 use crate::engine::health::Counters;
 use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::identity;
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::{self, Cost, Read};
 use crate::engine::schedule::{Polls, Urgency};
@@ -186,10 +187,7 @@ impl DeviceState {
     }
 
     fn identification_call(&self) -> Option<Call> {
-        self.settings.device.identify.as_ref().map(|identify| match identify {
-            Identify::Names { .. } => Call::ReadIdentification { code: 1, object: 0 },
-            Identify::Word { at, .. } => Call::Read(*at),
-        })
+        self.settings.device.identify.as_ref().map(identity::question)
     }
 
     pub(super) fn begin_read(&mut self, read: usize, now: Time) {
@@ -259,7 +257,7 @@ impl DeviceState {
         context: &mut Context,
     ) {
         match (result, &self.settings.device.identify) {
-            (Ok(answer), Some(identify)) => match check_identity(identify, &answer) {
+            (Ok(answer), Some(identify)) => match identity::check(identify, &answer) {
                 Ok(identity) => {
                     self.identity = Some(identity);
                     self.arrive(now, context);
@@ -429,29 +427,5 @@ impl DeviceState {
                 self.tell_info(context);
             }
         }
-    }
-}
-
-/// What the device said of itself if it is the right one, else what is wrong with that.
-fn check_identity(identify: &Identify, answer: &Answer) -> Result<String, String> {
-    match (identify, answer) {
-        (Identify::Names { vendor, product }, Answer::Identification(found)) => {
-            let object = |number: u8| {
-                let object = found.objects.iter().find(|(id, _)| *id == number);
-                object.map_or("", |(_, text)| text.as_str())
-            };
-            let told = format!("{} {} {}", object(0), object(1), object(2)).trim().to_string();
-            if object(0) == vendor && object(1) == product {
-                Ok(told)
-            } else {
-                Err(format!("it says that it is `{told}`, not `{vendor} {product}`"))
-            }
-        }
-        (Identify::Word { at, mask, equals }, Answer::Words(words)) => match words.first() {
-            Some(word) if word & mask == *equals => Ok(format!("{word:#06x}")),
-            Some(word) => Err(format!("{at} holds {word:#06x}, not {equals:#06x}")),
-            None => Err(format!("{at} is empty")),
-        },
-        _ => Err("its identification is of another kind".to_string()),
     }
 }
