@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 /// Within a paragraph of `engine/mod.rs` rustfmt sorts the names; the order within is this one.
 const ENGINE_ORDER: &[&[&str]] = &[
     &["time", "value", "address"],
-    &["yaml", "device", "test_device", "codec", "units", "settings", "wanted", "profile", "configuration"],
+    &["yaml", "device", "test_device", "codec", "units", "settings", "profile", "wanted", "configuration"],
     &["modbus", "plan", "schedule"],
     &["identity", "state"],
     &["topics", "health", "homeassistant", "outbox"],
