@@ -222,6 +222,8 @@ fn probe(folder: &Path) -> io::Result<()> {
 /// or new.
 fn replace(path: &Path, text: &str) -> io::Result<()> {
     let folder = path.parent().unwrap_or(Path::new("."));
+    // Somebody may have tidied up.
+    fs::create_dir_all(folder)?;
     let temporary = path.with_extension("json.new");
     let mut file = File::create(&temporary)?;
     file.write_all(text.as_bytes())?;

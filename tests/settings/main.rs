@@ -67,7 +67,11 @@ fn what_is_dumped_from_one_device_makes_another_like_it() {
     for (profile, unit, changes) in [
         (RELAYS, 18, &[("watchdog", "12.5"), ("relay_2_default", "ON")][..]),
         // The start of a meter is written in the digits that its decimals give it.
-        (METERS, 20, &[("meter_1_decimals", "3"), ("meter_1_start", "1.234"), ("meter_4_button_enabled", "OFF")]),
+        (
+            METERS,
+            20,
+            &[("meter_1_decimals", "3"), ("meter_1_start", "1.234"), ("meter_4_button_enabled", "OFF")],
+        ),
     ] {
         let (_one, one) = fresh(profile, unit);
         for (point, value) in changes {
@@ -130,12 +134,16 @@ fn nothing_is_written_to_another_device_nor_from_a_faulty_file() {
     let file = folder.file("relays.yaml", "watchdog: 30s\n");
     let wrong = by_hand(&["settings", "apply", &file, "--yes"], &port, RELAYS, 20);
     assert_eq!(wrong.status.code(), Some(1), "{wrong:?}");
-    assert!(text(&wrong.stderr).contains("unit 20 is no metz-connect/mr-do4: it says that it is"), "{wrong:?}");
+    assert!(
+        text(&wrong.stderr).contains("unit 20 is no metz-connect/mr-do4: it says that it is"),
+        "{wrong:?}"
+    );
 
     let file = folder.file("faulty.yaml", "meter_1_decimals: 4\nmeter_9_start: 3\n");
     let faulty = by_hand(&["settings", "apply", &file, "--yes"], &port, METERS, 20);
     assert_eq!(faulty.status.code(), Some(2), "{faulty:?}");
-    for wanted in ["faulty.yaml:1:19: `4` is outside 0 to 3", "faulty.yaml:2:1: ", "2 faults, nothing was written"]
+    for wanted in
+        ["faulty.yaml:1:19: `4` is outside 0 to 3", "faulty.yaml:2:1: ", "2 faults, nothing was written"]
     {
         assert!(text(&faulty.stderr).contains(wanted), "{wanted}: {faulty:?}");
     }
@@ -208,12 +216,13 @@ impl Drop for Gateway {
 
 /// Waits for a device's info, after the first `from` messages, in which the drift is this.
 fn wait_for_drift(observer: &Observer, from: usize, drift: &str) {
+    let wanted: serde_json::Value = serde_json::from_str(drift).expect("JSON");
     wait_for(drift, || {
         let seen = observer.seen();
         let mut infos = seen.iter().skip(from).filter(|seen| seen.topic == "busker/relays/info");
         infos.find(|seen| {
             let info: serde_json::Value = serde_json::from_str(&seen.payload).expect("JSON");
-            info["online"] == true && info["drift"].to_string() == drift
+            info["online"] == true && info["drift"] == wanted
         })?;
         Some(())
     });
