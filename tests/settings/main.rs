@@ -8,7 +8,8 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use busker::simulator::{DeviceAt, Framing, Options, Simulation, TcpPort};
+use busker::engine::profile::Library;
+use busker::simulator::{DeviceAt, Framing, Model, Options, Simulation, TcpPort};
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
@@ -102,6 +103,21 @@ fn what_is_dumped_from_one_device_makes_another_like_it() {
 
         let again = by_hand(&["settings", "apply", &file, "--yes"], &other, profile, unit);
         assert!(again.status.success() && text(&again.stdout).starts_with("nothing to change"), "{again:?}");
+    }
+}
+
+#[test]
+fn what_any_device_holds_can_stand_under_its_settings() {
+    let folder = Folder::new();
+    let library = Library::shipped();
+    for model in Model::ALL.into_iter().filter(|model| library.contains(model.id())) {
+        let (profile, unit) = (model.id(), 9);
+        let (_simulation, port) = fresh(profile, unit);
+        let dumped = dump(&port, profile, unit);
+        let file = folder.file("dumped.yaml", &dumped);
+        let applied = by_hand(&["settings", "apply", &file, "--yes"], &port, profile, unit);
+        assert!(applied.status.success(), "{profile}: {applied:?}\n{dumped}");
+        assert!(text(&applied.stdout).starts_with("nothing to change"), "{profile}: {applied:?}\n{dumped}");
     }
 }
 
