@@ -150,6 +150,28 @@ devices:
 }
 
 #[test]
+fn settings_are_taken_as_they_stand_with_and_without_enforcement() {
+    let (settings, _) = good(
+        "
+buses: {plant: {tcp: 'h:502'}}
+devices:
+  relays:
+    bus: plant
+    unit: 1
+    points:
+      delay: {at: holding 1, unit: s, poll: slow, write: 0..60, persistent: true}
+      inverted: {at: holding 2.0, poll: slow, write: any}
+    home_assistant: {inverted: {category: config}}
+    settings:
+      inverted: ON
+      delay: {value: 0.5m, enforce: true}
+",
+    );
+    let wanted = |point, value: &str, enforce| Wanted { point, value: value.into(), enforce };
+    assert_eq!(settings.devices[0].wanted, [wanted(1, "ON", false), wanted(0, "0.5m", true)]);
+}
+
+#[test]
 fn a_faulty_profile_is_told_with_its_own_place() {
     let mut library = library();
     library.add("acme/bad.yaml", "/etc/p/acme/bad.yaml", b"device: acme/bad\nmodel: [\n".to_vec());
@@ -175,7 +197,8 @@ proptest! {
         let whole = "mqtt: {url: 'mqtt://h', username: u, password: p}\nhttp: {listen: 'h:0'}\n\
             buses: {b: {serial: /dev/x, baud: 9600, gap: 2ms}, c: {tcp: '[::1]:502'}}\n\
             devices:\n  d: {profile: acme/ra2, bus: b, unit: 3, points: {flow: {unit: m, deadband: 1}}}\n  \
-            e: {bus: c, unit: 0, points: {x: {at: input 0, poll: fast}}}\n";
+            e: {bus: c, unit: 0, points: {x: {at: holding 0, poll: slow, write: 0..9, persistent: true}}, \
+            settings: {x: {value: 3, enforce: true}}}\n";
         let mut bytes = whole.as_bytes().to_vec();
         let at = at % bytes.len();
         if cut { bytes.truncate(at) } else { bytes[at] = byte }
