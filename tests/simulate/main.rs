@@ -1,6 +1,7 @@
 //! `busker simulate` as a person uses it: arguments, commands on its standard input, and its end; and
 //! the simulated devices against the profiles.
 
+#[expect(dead_code, reason = "some of it is for tests/strangers")]
 #[path = "../strangers/broker.rs"]
 mod broker;
 mod two_readings;
