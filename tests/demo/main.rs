@@ -9,6 +9,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
+use busker::simulator::Model;
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Winsize, tcsetwinsize};
@@ -105,6 +106,25 @@ fn on_a_terminal_it_is_a_table_that_is_redrawn_in_place() {
         text.split("\x1b[H").skip(1).all(|frame| frame.starts_with("busker demo: 4 simulated")),
         "{text}"
     );
+}
+
+#[test]
+fn with_all_every_device_that_there_is_answers() {
+    let mut demo = Demo::start(Command::new(env!("CARGO_BIN_EXE_busker")).args(["demo", "--all"]));
+    let introduction = demo.introduction();
+    let mut awaited: Vec<String> =
+        Model::ALL.map(|model| format!("{} online", model.id().replace(['/', '-'], "_"))).to_vec();
+    while !awaited.is_empty() {
+        let online = demo.wait_for("every device online", |line| awaited.iter().any(|other| other == line));
+        awaited.retain(|other| *other != online);
+    }
+    let health = ureq::get(&introduction.health).call().expect("health is answered");
+    let health: serde_json::Value =
+        serde_json::from_reader(health.into_body().into_reader()).expect("health is JSON");
+    assert_eq!(health["status"], "ok", "{health}");
+    assert_eq!(health["buses"].as_object().map(serde_json::Map::len), Some(3), "{health}");
+    demo.signal(Signal::TERM);
+    assert_eq!(demo.wait().code(), Some(0));
 }
 
 #[test]
