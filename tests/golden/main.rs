@@ -6,9 +6,11 @@
 
 mod coverage;
 mod discovery;
+mod manual;
 mod points;
 mod properties;
 mod readings;
+mod rows;
 
 use std::fs;
 use std::path::PathBuf;
