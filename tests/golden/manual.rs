@@ -124,7 +124,7 @@ fn about(device: &Device, point: &Point, row: &Row) -> Vec<String> {
         }
     };
     compare("type", kind_said(device, point, row), kind(device, point));
-    compare("access", said_as(row.access), access(point, row));
+    compare("access", said_as(row.access), access(device, row));
     compare("eeprom", yes(row.is_persistent), yes(point.persistent));
     compare("default", or_dash(row.default), or_dash(point.default));
     if let (Encoding::Plain(form), false) = (&point.encoding, point.is_button()) {
@@ -187,8 +187,20 @@ fn kind(device: &Device, point: &Point) -> String {
         _ if point.is_button() => "press".into(),
         Encoding::Cases { by, .. } => by_point(&device.points[*by]),
         Encoding::Plain(form) if form.elements > 1 => format!("{}×{}", form.kind.name(), form.elements),
-        Encoding::Plain(form) if form.kind == Kind::U16 && point.at.bits.is_some() => "bits".into(),
+        Encoding::Plain(form) if form.kind == Kind::U16 => match bits(point) {
+            Some(1) => "bool".into(),
+            Some(_) => "bits".into(),
+            None => form.kind.name(),
+        },
         Encoding::Plain(form) => form.kind.name(),
+    }
+}
+
+/// How many bits the point has, if it is no register.
+fn bits(point: &Point) -> Option<u32> {
+    match point.at.bits {
+        Some(bits) => Some(bits.width().into()),
+        None => point.at.span.table().is_bits().then(|| point.at.span.count()),
     }
 }
 
@@ -202,25 +214,30 @@ fn said_as(access: Access) -> String {
     word.into()
 }
 
-/// What the point does at the row's place, where it may stand in two: it is read and written at the one
-/// that costs less, and the other is none the worse for it.
-fn access(point: &Point, row: &Row) -> String {
-    let is_read_here = !point.is_button() && (point.at == row.place || point.also == Some(row.place));
-    let reads = match row.access {
+/// What the points do at the row's place. A value that stands in two places is read and written at the
+/// one that costs less, and one point may read what another writes.
+fn access(device: &Device, row: &Row) -> String {
+    let here = || device.points.iter().filter(|point| lies_at(point, row.place));
+    let is_written_at =
+        |place| device.points.iter().filter_map(|point| point.write.as_ref()).any(|write| write.at == place);
+    let reads = here().any(|point| match row.access {
         Access::ReadWrite => !point.is_button(),
-        Access::Write => is_read_here && point.is_read(),
-        _ => is_read_here,
+        access => is_read_at(point, row.place) && (access != Access::Write || point.is_read()),
+    });
+    let writes = match row.access {
+        Access::Read => is_written_at(row.place),
+        _ => here().flat_map(places_of).any(is_written_at),
     };
-    let writes = match (&point.write, row.access) {
-        (Some(write), Access::Read) => write.at == row.place,
-        (write, _) => write.is_some(),
-    };
-    said_as(match (reads, writes) {
-        (true, true) => Access::ReadWrite,
-        (true, false) => Access::Read,
-        (false, true) => Access::Write,
-        (false, false) => return "nothing".into(),
-    })
+    match (reads, writes) {
+        (true, true) => "rw".into(),
+        (true, false) => "r".into(),
+        (false, true) => "w".into(),
+        (false, false) => "-".into(),
+    }
+}
+
+fn is_read_at(point: &Point, place: Address) -> bool {
+    !point.is_button() && (point.at == place || point.also == Some(place))
 }
 
 fn scale_said(device: &Device, form: &Form, row: &Row) -> String {
@@ -258,7 +275,7 @@ fn unit(device: &Device, form: &Form) -> String {
 }
 
 /// The numbers that the profile names. A flag's need no names, and those of the registers that a point
-/// refers to are not the manual's.
+/// refers to are not the manual's. Where it is only written, some of the numbers will do.
 fn values(point: &Point, form: &Form, row: &Row) -> Vec<i128> {
     if row.values.is_empty() && (form.kind == Kind::Bool || point.refers.is_some()) {
         return Vec::new();
@@ -268,7 +285,8 @@ fn values(point: &Point, form: &Form, row: &Row) -> Vec<i128> {
         _ => form.names.list().iter().map(|(key, _)| *key).collect(),
     };
     keys.sort_unstable();
-    keys
+    let are_some = !is_read_at(point, row.place) && keys.iter().all(|key| row.values.contains(key));
+    if are_some { row.values.clone() } else { keys }
 }
 
 type Bounds = (Option<Decimal>, Option<Decimal>);
@@ -290,10 +308,10 @@ fn bounds(point: &Point, form: &Form) -> Bounds {
         Some(WriteRule::Names(written)) => {
             ends_of_names(form, |name| written.iter().any(|written| written == name))
         }
-        rule => match (rule, form.range) {
-            (None, Some((min, max))) => in_register(form, min, max),
-            _ if matches!(form.names, Names::All(_)) => ends_of_names(form, |_| true),
-            _ => whole_range(point, form),
+        _ => match (form.range, &form.names) {
+            (Some((min, max)), _) => in_register(form, min, max),
+            (None, Names::All(_)) => ends_of_names(form, |_| true),
+            (None, _) => whole_range(point, form),
         },
     }
 }
@@ -306,10 +324,7 @@ fn ends_of_names(form: &Form, is_meant: impl Fn(&str) -> bool) -> Bounds {
 
 fn whole_range(point: &Point, form: &Form) -> Bounds {
     let Some((min, max)) = form.kind.integer_range() else { return (None, None) };
-    let max = match point.at.bits {
-        Some(bits) => max.min((1 << bits.width()) - 1),
-        None => max,
-    };
+    let max = bits(point).map_or(max, |bits| max.min((1 << bits) - 1));
     (Some(Decimal::integer(min)), Some(Decimal::integer(max)))
 }
 
