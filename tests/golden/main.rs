@@ -3,6 +3,7 @@
 //! `tests/golden/<profile>/` holds `points.txt` (the expanded points), `plan.txt` (what is read),
 //! `readings.txt` (registers and what they say; the registers are written by hand) and
 //! `discovery.json` (what Home Assistant is told). `BLESS=1` rewrites them; read the difference.
+//! `manual.tsv` is a second reading of the manual, written by hand alone.
 
 mod coverage;
 mod discovery;

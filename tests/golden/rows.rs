@@ -1,11 +1,18 @@
 //! The file `manual.tsv`: what a device's manual says of each register, as somebody read it who had not
-//! seen the profile. Tab-separated, `#` begins a comment, the first line is [`HEADER`].
+//! seen the profile. Tab-separated, `#` begins a comment, the first line is [`HEADER`], `-` stands where
+//! the manual says nothing.
 //!
-//! A place is `coil 0`, `holding 16.0..7`, `input 42..43`; with `each` behind it the row stands for
-//! several: `holding 2..5 each` for each register, `input 0..11 each 3` for values of three registers,
-//! `holding 1.0..3 each` for each bit, `holding 36..39.8..15 each` for that field of each register.
-//! `by:holding 16.0..7` is a place that decides; `by:holding 16.0..7 +1` lies one register further
-//! (`+1bit`: one bit) with each repetition.
+//! * `place` is `coil 0`, `holding 16.0..7`, `input 42..43`. With `each` behind it the row stands for
+//!   several: `holding 2..5 each` for each register, `input 0..11 each 3` for values of three registers,
+//!   `holding 1.0..3 each` for each bit, `holding 36..39.8..15 each` for that field of each register.
+//! * `type` is a profile's word for it (`u16`, `f32`, `text 8`), `bits` for a field of several, `i16×128` for
+//!   an array, `press` for an order whose word is `min` and `max`; or `by:holding 16.0..7` where that place
+//!   decides, and then scale, unit, min and max are its. `by:holding 16.0..7 +1` lies one register further
+//!   (`+1bit`: one bit) with each repetition. `scale` and `unit` may be `by` a place too.
+//! * `scale` is what one step is in the unit. `min`, `max` and `default` are the register's own numbers: what
+//!   may be written, and where nothing may, what can be read.
+//! * `access` is `r`, `w`, `rw`, or `out` for what the profile leaves out.
+//! * `values` are `0=off 1=on`, in the manual's words; only the numbers are compared.
 
 use std::str::FromStr;
 
