@@ -141,6 +141,11 @@ fn about(device: &Device, point: &Point, row: &Row) -> Vec<String> {
             compare("max", or_dash(manual.1), or_dash(profile.1));
         }
     }
+    if let (Encoding::Cases { cases, .. }, false) = (&point.encoding, row.values.is_empty()) {
+        let names = cases.iter().filter_map(|case| case.form.as_ref()).flat_map(|form| form.names.list());
+        let keys: BTreeSet<i128> = names.map(|(key, _)| *key).collect();
+        compare("values", list(&row.values), list(&keys.into_iter().collect::<Vec<_>>()));
+    }
     if let Some(WriteRule::Press { word, .. }) = point.write.as_ref().map(|write| &write.rule) {
         compare("word", or_dash(row.min.map(Decimal::normalized)), word.to_string());
     }
@@ -363,7 +368,7 @@ points:
   digits: {at: holding 2.0..7, poll: slow, write: 0..3}
   total: {at: input 0, type: u32, decimals: digits, unit: kWh, poll: slow}
   limit: {at: holding 3, type: i16, scale: 0.5, decimals: 1, unit: V, poll: slow, write: -5..0.52}
-  value: {at: input 2, poll: fast, by: mode, is: {volt: {unit: V}, amp: {unit: A}}}
+  value: {at: input 2, poll: fast, by: mode, is: {volt: {unit: V, type: u16, values: {9: max}}, amp: {unit: A}}}
   reset: {at: holding 4, press: 0x55AA}
 left_out: {holding 65: line settings}
 ";
@@ -375,7 +380,7 @@ holding 1|u16|-|-|rw|-|-|1|yes|0=volt 1=amp
 holding 2.0..7|bits|-|-|rw|0|3|-|no|-
 input 0..1|u32|by:holding 2.0..7|kWh|r|-|-|-|no|-
 holding 3|i16|0.05|V|rw|-100|10|-|no|-
-input 2|by:holding 1|-|-|r|-|-|-|no|-
+input 2|by:holding 1|-|-|r|-|-|-|no|9=max
 holding 4|press|-|-|w|21930|21930|-|no|-
 holding 65|-|-|-|out|-|-|-|-|-
 ";
@@ -413,6 +418,7 @@ fn each_difference_between_table_and_profile_is_told() {
     cell("-100|10", "-100|11", "holding 3 (limit): max is 11 in the manual, 10 in the profile");
     cell("-100|10", "-|10", "holding 3 (limit): min is -32768 in the manual, -100 in the profile");
     cell("0=volt 1=amp", "1=amp", "holding 1 (mode): values is 1 in the manual, 0 1 in the profile");
+    cell("9=max", "8=max", "input 2 (value): values is 8 in the manual, 9 in the profile");
     cell("by:holding 1", "u16", "input 2 (value): type is u16 in the manual, by:holding 1 in the profile");
     cell(
         "21930|21930",
