@@ -267,8 +267,17 @@ fn invalid_reason(form: &Form, words: &[u16], raw: &Raw) -> Option<String> {
         .map(|(_, reason)| reason.clone())
 }
 
+/// A register value without a name stands for the one that means all others, if there is one.
+pub fn meant(form: &Form, raw: i128) -> i128 {
+    match form.others {
+        Some(others) if name_of(form.names.list(), raw).is_none() => others,
+        _ => raw,
+    }
+}
+
 fn read_integer(resolved: &Resolved<'_>, raw: i128) -> Reading {
     let form = resolved.form;
+    let raw = meant(form, raw);
     match (&form.names, name_of(form.names.list(), raw)) {
         (_, Some(name)) if form.kind != Kind::Bool => return Reading::Name(name.to_string()),
         (Names::All(_), None) => return Reading::Missing(Missing::UnknownValue(raw)),

@@ -301,6 +301,8 @@ pub struct Form {
     pub difference: bool,
     /// Names of register values. With [`Kind::Bool`] they are what `ON` and `OFF` are not needed for.
     pub names: Names,
+    /// Every register value without a name means what this one means.
+    pub others: Option<i128>,
     /// Register values that stand for "no reading", and why.
     pub invalid: Vec<(i128, String)>,
     /// What the manual gives as the measuring range, in the unit; for temperatures in °C.
@@ -320,6 +322,7 @@ impl Form {
             unit: Unit::None,
             difference: false,
             names: Names::None,
+            others: None,
             invalid: Vec::new(),
             range: None,
         }

@@ -204,8 +204,9 @@ impl Values {
 
 /// The raw integer of a selector; `None` when its words are invalid.
 fn known_field(point: &Point, field: &[u16]) -> Option<i128> {
-    match codec::raw(point.plain()?, field) {
-        Raw::Integer(raw) => Some(raw),
+    let form = point.plain()?;
+    match codec::raw(form, field) {
+        Raw::Integer(raw) => Some(codec::meant(form, raw)),
         _ => None,
     }
 }

@@ -290,6 +290,10 @@ fn values(point: &Point, form: &Form, row: &Row) -> Vec<i128> {
         _ => form.names.list().iter().map(|(key, _)| *key).collect(),
     };
     keys.sort_unstable();
+    // Values that the manual tells apart and the profile does not, since they mean the same.
+    if form.others.is_some() && keys.iter().all(|key| row.values.contains(key)) {
+        return row.values.clone();
+    }
     let are_some = !is_read_at(point, row.place) && keys.iter().all(|key| row.values.contains(key));
     if are_some { row.values.clone() } else { keys }
 }

@@ -136,6 +136,7 @@ fn point(device: &Device, index: PointIndex) -> Json {
         "max": range.map(|(_, max)| number(max)),
         "default": point.default.map(|default| number(Decimal::integer(default))),
         "values": values(&point.encoding),
+        "others": plain.and_then(|form| form.others).map(|others| others.to_string()),
         "invalid": invalid(&point.encoding),
         "re_read": point.re_read.iter().map(|other| name(device, *other)).collect::<Vec<_>>(),
         "by": selector(device, point).filter(|by| by.refers.is_none()).map(|by| &by.name),

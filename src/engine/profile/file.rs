@@ -204,6 +204,8 @@ record! {
         unit_by: Option<At<PointPath>>,
         /// Names of register values, or a shared file.
         values: Option<At<Values>>,
+        /// The name, one of `values`, for every register value that has none.
+        others: Option<At<String>>,
         /// Names of the shared file that this device does not have.
         without: Vec<At<String>> = Vec::new(),
         /// Register values that mean "no reading", with the reason.

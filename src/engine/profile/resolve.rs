@@ -145,6 +145,7 @@ impl Resolution<'_, '_> {
             (None, Some(path), None) => self.lookup(path, expanded).map_or(Unit::None, Unit::By),
             (None, None, _) => Unit::None,
         };
+        resolved.others = form.others.as_ref().and_then(|others| self.value_called(others, &names));
         resolved.difference = expanded.file.difference;
         resolved.names = match names {
             _ if kind == Kind::Bool => Names::None,
@@ -322,17 +323,8 @@ impl Resolution<'_, '_> {
             },
             (None, None) => return None,
         };
-        let on_change = file.on_change.as_ref().and_then(|between| {
-            let names = self.names(expanded, &file.form);
-            let found = names.iter().find(|(_, name)| *name == between.value).map(|(raw, _)| *raw);
-            if found.is_none() {
-                let known: Vec<&str> = names.iter().map(|(_, name)| name.as_str()).collect();
-                let choices = list_of_choices(&between.value, &known);
-                let message = format!("`{}` is none of the point's `values`; {choices}", between.value);
-                self.faults.add(&between.place, message);
-            }
-            found
-        });
+        let names = self.names(expanded, &file.form);
+        let on_change = file.on_change.as_ref().and_then(|between| self.value_called(between, &names));
         Some(Write {
             at: expanded.write_at.unwrap_or(expanded.at),
             with: file.write_with.as_ref().map(|function| function.value),
@@ -340,6 +332,18 @@ impl Resolution<'_, '_> {
             settle: file.settle.as_ref().map(|settle| settle.value).unwrap_or_default(),
             on_change,
         })
+    }
+
+    /// The register value of one of a point's own names.
+    fn value_called(&mut self, wanted: &At<String>, names: &[(i128, String)]) -> Option<i128> {
+        let found = names.iter().find(|(_, name)| *name == wanted.value).map(|(raw, _)| *raw);
+        if found.is_none() {
+            let known: Vec<&str> = names.iter().map(|(_, name)| name.as_str()).collect();
+            let choices = list_of_choices(&wanted.value, &known);
+            let message = format!("`{}` is none of the point's `values`; {choices}", wanted.value);
+            self.faults.add(&wanted.place, message);
+        }
+        found
     }
 
     /// Whether what the shared cases say of units can be resolved: with the point that they name, or with

@@ -17,6 +17,7 @@ impl Rules<'_, '_> {
         self.scales_and_units_are_said_once();
         self.only_shared_names_are_left_out();
         self.names_of_values_are_unique();
+        self.others_belong_to_an_enumeration();
         self.named_and_invalid_values_are_possible();
         self.what_decides_is_read();
         self.the_watchdog_is_read();
@@ -174,6 +175,19 @@ impl Rules<'_, '_> {
         }
     }
 
+    fn others_belong_to_an_enumeration(&mut self) {
+        for Subject { file, point, .. } in self.entries() {
+            let Some(others) = file.form.others.as_ref() else { continue };
+            let is_enumeration = point.plain().is_some_and(|form| matches!(form.names, Names::All(_)));
+            if !is_enumeration && file.form.values.is_some() {
+                self.faults.add(
+                    &others.place,
+                    "`others` of a number or a flag, which every value already means something to; remove it",
+                );
+            }
+        }
+    }
+
     fn named_and_invalid_values_are_possible(&mut self) {
         for Subject { file, expanded, point } in self.entries() {
             if expanded.is_flag {
@@ -313,6 +327,7 @@ fn said(form: &Form) -> Vec<(&'static str, &Place)> {
     said.extend(form.unit.as_ref().map(|key| ("unit", &key.place)));
     said.extend(form.unit_by.as_ref().map(|key| ("unit_by", &key.place)));
     said.extend(form.values.as_ref().map(|key| ("values", &key.place)));
+    said.extend(form.others.as_ref().map(|key| ("others", &key.place)));
     said.extend(form.range.as_ref().map(|key| ("range", &key.place)));
     said
 }
