@@ -12,3 +12,4 @@ mod thing;
 pub use announcement::{Announcement, Gateway, announcement, farewell};
 pub use entity::{Entity, companions, entity, is_settled};
 pub use gateway::{announce_bridge, announce_bus};
+pub use thing::name_of_thing;

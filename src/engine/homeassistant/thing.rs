@@ -60,6 +60,11 @@ pub(super) fn as_shown<'d>(
     Some(shown)
 }
 
+/// What people read beside the device's name, in sentence case.
+pub fn name_of_thing(thing: &Thing) -> String {
+    thing.presentation.name.clone().unwrap_or_else(|| sentence(&thing.name))
+}
+
 /// The discovery component of a thing; `None` while it does not live.
 pub(super) fn thing_component(
     topics: &Topics,
@@ -72,7 +77,7 @@ pub(super) fn thing_component(
     }
     let presentation = &thing.presentation;
     let platform = thing.kind.name();
-    let name = presentation.name.clone().unwrap_or_else(|| sentence(&thing.name));
+    let name = name_of_thing(thing);
     let mut component = Map::new();
     let mut put = |key: &str, value: Value| component.insert(key.into(), value);
     put("platform", platform.into());

@@ -1,7 +1,9 @@
 //! `busker profiles docs`: a page for people about each device, and the list of all of them.
 
+mod modes;
 mod page;
 mod points;
+mod things;
 mod words;
 
 use std::fmt::Write as _;
@@ -157,12 +159,18 @@ mod tests {
 
     fn check_links(path: &str, text: &str) {
         for link in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
-            let there = match link.strip_prefix("#table-") {
-                Some(number) => text.contains(&format!("\n### Table {number}\n")),
+            let there = match link.strip_prefix('#') {
+                Some(heading) => text.lines().any(|line| is_heading(line, heading)),
                 None => Path::new(FOLDER).join(path).with_file_name(link).exists(),
             };
             assert!(there, "{path} links to {link}, which is not there");
         }
+    }
+
+    /// Whether `line` is the heading that a link to `#heading` leads to.
+    fn is_heading(line: &str, heading: &str) -> bool {
+        let title = line.strip_prefix("## ").or_else(|| line.strip_prefix("### "));
+        title.is_some_and(|title| title.to_lowercase().replace(' ', "-") == heading)
     }
 
     #[test]
@@ -210,13 +218,96 @@ mod tests {
         }
     }
 
+    #[test]
+    fn what_is_not_always_there_stands_under_the_operating_modes() {
+        let library = Library::shipped();
+        for id in library.ids() {
+            let device = library.load(id).expect("a good profile");
+            let page = page::page(&device);
+            let modes =
+                page.split("\n## Operating modes\n").nth(1).and_then(|rest| rest.split("\n## ").next());
+            let deciding = device.points.iter().flat_map(|point| &point.when);
+            for condition in deciding.chain(device.things.iter().flat_map(|thing| &thing.when)) {
+                let decider = &device.points[condition.point];
+                let modes = modes.unwrap_or_else(|| panic!("{id} has modes"));
+                for (raw, name) in &condition.values {
+                    let row = |line: &str| {
+                        line.starts_with(&format!("| `{name}`")) && line.contains(&format!("| {raw} |"))
+                    };
+                    assert!(modes.lines().any(row), "{id}: {} {name}", decider.name);
+                }
+            }
+            for thing in &device.things {
+                let told = page.lines().any(|line| line.contains(&format!("`{}`", thing.name)));
+                assert!(told, "{id} {}", thing.name);
+            }
+        }
+    }
+
     /// The page holds each of `expected`.
     #[track_caller]
     fn check_page(id: &str, expected: &[&str]) {
-        let page = page::page(&Library::shipped().load(id).expect("a good profile"));
+        check_page_of(&Library::shipped().load(id).expect("a good profile"), expected);
+    }
+
+    #[track_caller]
+    fn check_page_of(device: &Device, expected: &[&str]) {
+        let page = page::page(device);
         for expected in expected {
-            assert!(page.contains(expected), "{id}: {expected:?} is not in\n{page}");
+            assert!(page.contains(expected), "{}: {expected:?} is not in\n{page}", device.profile);
         }
+    }
+
+    /// The page of a profile that is no shipped one.
+    #[track_caller]
+    fn check_page_of_file(path: &str, expected: &[&str]) {
+        let bytes = fs::read(path).expect("the file");
+        check_page_of(&Library::shipped().check(path, &bytes).expect("a good profile"), expected);
+    }
+
+    #[test]
+    fn a_page_says_what_is_there_in_which_mode_and_what_several_points_are_together() {
+        check_page_of_file(
+            "tests/transcripts/damper.yaml",
+            &[
+                "* **Selections**: Mode\n",
+                "In some [operating modes](#operating-modes):\n\n* **Covers**: Damper\n* **Switches**: Relay\n",
+                "* **Heartbeat.** The device wants `drive` to be written again and again, at the latest after \
+                 `receive_time`",
+                "### `mode`: Mode\n",
+                "| `direct` | 0 |  | `relay` |\n",
+                "| `motor` | 1 | cover `damper`; button `acknowledge` | `drive`, `position`, `alarm` |\n",
+                "A cover, `damper`. There while `mode` is `motor`.\n",
+                "on `busker/damper/damper`, is the first of these that holds:\n",
+                "| `opening` | `position` is `running`, and `drive` is `open` |\n",
+                "Pressed by a message on `busker/damper/acknowledge/set`:\n",
+                "| `press` | `open` to `drive` (1 in holding 1), then `ok` to `alarm` (1 in holding 3) |\n",
+                "shows `drive`, `position` as part of it and not by themselves.",
+                "| part of `damper` | `mode` is `motor` |  | `open`, `close` | yes, read back after 100 ms, repeated by busker \
+                 within `receive_time` | holding 1 |",
+            ],
+        );
+    }
+
+    #[test]
+    fn a_page_says_what_is_an_event_what_is_fetched_and_what_one_register_makes_of_another() {
+        check_page_of_file(
+            "tests/transcripts/blind.yaml",
+            &[
+                "`busker/blind/pressed` gets `{\"event_type\":\"pressed\"}`",
+                "| `pressed` | `pressed` | input 0.0 |\n",
+                "yes, the same again with `locked` between",
+                "yes, read back after 600 ms, at coil 2..3 | discrete 8..9 |",
+            ],
+        );
+        check_page_of_file(
+            "tests/transcripts/recorder.yaml",
+            &[
+                "send an empty message to `busker/recorder/curve/get`",
+                "| `curve` | 5 V | 2 | `recording` is `stopped` | input 10..14 |\n",
+                "as the point that `of` names: [table 1](#table-1)",
+            ],
+        );
     }
 
     #[test]

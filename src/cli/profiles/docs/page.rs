@@ -2,9 +2,11 @@
 
 use std::fmt::Write as _;
 
-use super::{points, words};
-use crate::engine::device::{Device, Encoding, Identify, Platform, Point, PointIndex, Poll, WriteRule};
-use crate::engine::homeassistant::Entity;
+use super::{modes, points, things, words};
+use crate::engine::device::{
+    Category, Device, Encoding, Identify, Platform, Point, PointIndex, Poll, WriteRule,
+};
+use crate::engine::homeassistant::{Entity, name_of_thing};
 
 /// The page, in Markdown.
 pub fn page(device: &Device) -> String {
@@ -14,45 +16,80 @@ pub fn page(device: &Device) -> String {
     page.shown_at_once(&mut text);
     page.to_copy(&mut text);
     page.take_care(&mut text);
+    modes::modes(&page, &mut text);
+    things::things(&page, &mut text);
     page.wire(&mut text);
     points::points(&page, &mut text);
     page.left_out(&mut text);
     text
 }
 
-/// The names of everything that Home Assistant shows without being asked to, by what it is there.
-fn shown_at_once(device: &Device) -> Vec<(Platform, String)> {
-    by_platform(device, |entity| entity.enabled)
-}
-
-/// The same without settings and diagnostics: what the device is for.
+/// The names of what the device is for, without settings and diagnostics, by what they are in Home
+/// Assistant.
 pub fn main_entities(device: &Device) -> Vec<(Platform, String)> {
-    by_platform(device, |entity| entity.enabled && entity.category.is_none())
+    by_platform(&Shown::all_of(&Page::of(device)), |shown| shown.is_enabled && shown.category.is_none())
 }
 
-fn by_platform(device: &Device, wanted: impl Fn(&Entity) -> bool) -> Vec<(Platform, String)> {
-    let entities: Vec<Entity> = (0..device.points.len())
-        .filter_map(|index| words::entity_of(device, index))
-        .filter(|entity| wanted(entity))
-        .collect();
-    let mut shown = Vec::new();
+/// A point or a thing as Home Assistant shows it.
+struct Shown {
+    platform: Platform,
+    name: String,
+    category: Option<Category>,
+    is_enabled: bool,
+    /// Whatever the mode.
+    is_always_there: bool,
+}
+
+impl Shown {
+    fn all_of(page: &Page<'_>) -> Vec<Shown> {
+        let things = page.device.things.iter().map(|thing| Shown {
+            platform: thing.kind.platform(),
+            name: name_of_thing(thing),
+            category: thing.presentation.category,
+            is_enabled: thing.presentation.enabled.unwrap_or(true),
+            is_always_there: thing.when.is_empty(),
+        });
+        let points = page.device.points.iter().zip(&page.entities).filter_map(|(point, entity)| {
+            let entity = entity.as_ref()?;
+            Some(Shown {
+                platform: entity.platform,
+                name: entity.name.clone(),
+                category: entity.category,
+                is_enabled: entity.enabled,
+                is_always_there: point.when.is_empty(),
+            })
+        });
+        things.chain(points).collect()
+    }
+}
+
+fn by_platform(all: &[Shown], wanted: impl Fn(&Shown) -> bool) -> Vec<(Platform, String)> {
+    let mut told = Vec::new();
     for platform in [
+        Platform::Cover,
+        Platform::Valve,
+        Platform::Climate,
         Platform::Switch,
         Platform::Select,
         Platform::Number,
         Platform::Sensor,
         Platform::BinarySensor,
+        Platform::Event,
         Platform::Button,
         Platform::Text,
-        Platform::Event,
     ] {
-        let of_platform = entities.iter().filter(|entity| entity.platform == platform);
-        let names: Vec<&str> = of_platform.map(|entity| entity.name.as_str()).collect();
+        let mut names: Vec<&str> = Vec::new();
+        for shown in all.iter().filter(|shown| shown.platform == platform && wanted(shown)) {
+            // What is one thing in two modes is named once.
+            if !names.contains(&shown.name.as_str()) {
+                names.push(&shown.name);
+            }
+        }
         if !names.is_empty() {
-            shown.push((platform, words::together_plain(&names)));
+            told.push((platform, words::together_plain(&names)));
         }
     }
-    shown
+    told
 }
 
 /// A device and what Home Assistant makes of each of its points.
@@ -98,10 +135,19 @@ impl<'d> Page<'d> {
 
     fn shown_at_once(&self, text: &mut String) {
         let _ = writeln!(text, "## In Home Assistant\n");
-        for (platform, names) in shown_at_once(self.device) {
-            let _ = writeln!(text, "* **{}**: {names}", words::platform(platform).1);
+        let all = Shown::all_of(self);
+        let list = |shown: Vec<(Platform, String)>, text: &mut String| {
+            for (platform, names) in shown {
+                let _ = writeln!(text, "* **{}**: {names}", words::platform(platform).1);
+            }
+        };
+        list(by_platform(&all, |shown| shown.is_enabled && shown.is_always_there), text);
+        let in_some = by_platform(&all, |shown| shown.is_enabled && !shown.is_always_there);
+        if !in_some.is_empty() {
+            let _ = writeln!(text, "\nIn some [operating modes](#operating-modes):\n");
+            list(in_some, text);
         }
-        let off = self.entities.iter().flatten().filter(|entity| !entity.enabled).count();
+        let off = all.iter().filter(|shown| !shown.is_enabled).count();
         match off {
             0 => {}
             1 => {
@@ -161,11 +207,13 @@ devices:
     fn take_care(&self, text: &mut String) {
         let warnings: Vec<String> = [
             self.about_the_watchdog(),
+            self.about_heartbeats(),
             self.about_eeprom(),
             self.about_presses(),
             self.about_read_clears(),
             self.about_forbidden(),
             self.about_selectors(),
+            self.about_left_out(),
         ]
         .into_iter()
         .flatten()
@@ -197,6 +245,36 @@ devices:
              too.{factory}",
             self.device.points[index].name
         ))
+    }
+
+    fn about_heartbeats(&self) -> Option<String> {
+        let points = &self.device.points;
+        let beating = self.names_of(|point| point.heartbeat.is_some())?;
+        let mut times: Vec<PointIndex> = points.iter().filter_map(|point| point.heartbeat).collect();
+        times.dedup();
+        let mut factory: Vec<String> = times.iter().map(|time| words::default(self.device, *time)).collect();
+        factory.dedup();
+        let factory = match factory.as_slice() {
+            [same] if !same.is_empty() => format!(" From the factory it is {same} s."),
+            _ => String::new(),
+        };
+        Some(format!(
+            "**Heartbeat.** The device wants {beating} to be written again and again, at the latest after {} (0: it \
+             does not mind). Else it acts as its manual says, mostly by taking it for a fault. busker repeats in time, three times as often as it has to, what it has just read from the register, \
+             and never an older order. When busker, its computer or the line stops for longer, or with \
+             `on_broker_loss: stop_feeding` the MQTT broker, the device acts. Choose a time that is longer than a \
+             restart takes, unless that is what you want.{factory}",
+            self.names(&times)
+        ))
+    }
+
+    fn about_left_out(&self) -> Option<String> {
+        let left_out = &self.device.left_out;
+        (!left_out.is_empty()).then(|| {
+            "**Left out.** Not all that the manual has is here. What is missing on purpose, and why, stands at the \
+             end of the page: [Left out](#left-out)."
+                .into()
+        })
     }
 
     fn about_eeprom(&self) -> Option<String> {
@@ -239,18 +317,22 @@ devices:
     }
 
     fn about_selectors(&self) -> Option<String> {
-        let cases = |point: &&Point| matches!(point.encoding, Encoding::Cases { .. });
+        let cases =
+            |point: &&Point| matches!(point.encoding, Encoding::Cases { .. }) && point.write.is_some();
+        // Modes stand in a section of their own.
+        let of_meaning = |point: &Point| Point { when: Vec::new(), ..point.clone() }.selectors();
         let mut selectors: Vec<PointIndex> =
-            self.device.points.iter().filter(cases).flat_map(Point::selectors).collect();
+            self.device.points.iter().filter(cases).flat_map(of_meaning).collect();
         selectors.sort_unstable();
         selectors.dedup();
-        selectors.retain(|index| self.device.points[*index].write.is_some());
+        let points = &self.device.points;
+        selectors.retain(|index| points[*index].write.is_some() && points[*index].refers.is_none());
         if selectors.is_empty() {
             return None;
         }
         Some(format!(
-            "**Settings that change others.** What {} say decides what other registers mean. Set them first, \
-             and set what depends on them, such as limits and offsets, anew afterwards.",
+            "**Settings that change others.** What other registers mean depends on {}. Set them first, and \
+             set what depends on them, such as limits and offsets, anew afterwards.",
             self.names(&selectors)
         ))
     }
@@ -349,7 +431,7 @@ devices:
 }
 
 /// A name for the configuration, made of the profile's.
-fn device_name(device: &Device) -> String {
+pub fn device_name(device: &Device) -> String {
     let model = device.profile.rsplit('/').next().unwrap_or_default().replace('-', "_");
     if model.starts_with(|c: char| c.is_ascii_lowercase()) { model } else { format!("device_{model}") }
 }

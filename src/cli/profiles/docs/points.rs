@@ -47,13 +47,16 @@ struct Row {
     range: String,
     default: String,
     writing: String,
+    is_written_elsewhere: bool,
     kept: &'static str,
+    living: String,
 }
 
-const TITLES: [&str; 9] = [
+const TITLES: [&str; 10] = [
     "Point",
     "In Home Assistant",
     "Shown as",
+    "Only while",
     "Unit",
     "Can be",
     "Factory setting",
@@ -71,17 +74,8 @@ fn meanings(page: &Page<'_>, tables: &[LongTable], points: &[PointIndex], text: 
             None => rows.push((row, vec![index])),
         }
     }
-    let rows: Vec<[String; 9]> = rows.into_iter().map(|(row, sharing)| row.cells(page, &sharing)).collect();
-    // A column in which nothing stands only makes the others narrow.
-    let filled: Vec<usize> =
-        (0..TITLES.len()).filter(|column| rows.iter().any(|row| !row[*column].is_empty())).collect();
-    let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
-    text.push_str(&line(filled.iter().map(|column| TITLES[*column].to_string()).collect()));
-    text.push_str(&format!("|{}\n", "---|".repeat(filled.len())));
-    for row in &rows {
-        text.push_str(&line(filled.iter().map(|column| words::cell(&row[*column])).collect()));
-    }
-    text.push('\n');
+    let rows: Vec<[String; 10]> = rows.into_iter().map(|(row, sharing)| row.cells(page, &sharing)).collect();
+    words::table(&TITLES, &rows, text);
 }
 
 impl Row {
@@ -101,25 +95,35 @@ impl Row {
             Encoding::Cases { by, .. } => {
                 let link =
                     LongTable::link(tables, |table| table.cases_of.contains(&index)).unwrap_or_default();
-                (String::new(), format!("as `{}` says: {link}", device.points[*by].name))
+                let by = &device.points[*by];
+                let how = if by.refers.is_some() { "as the point that" } else { "as" };
+                let says = if by.refers.is_some() { "names" } else { "says" };
+                (String::new(), format!("{how} `{}` {says}: {link}", by.name))
             }
         };
-        let platform = page.entities[index].as_ref().map(|entity| {
-            let off = if entity.enabled { "" } else { ", *off*" };
-            format!("{}{off}", words::platform(entity.platform).0)
-        });
+        let shown_by = device.things.iter().find(|thing| thing.shows(index));
+        let platform = match (&page.entities[index], shown_by) {
+            (Some(entity), _) => {
+                let off = if entity.enabled { "" } else { ", *off*" };
+                format!("{}{off}", words::platform(entity.platform).0)
+            }
+            (None, Some(thing)) => of_any(format!("part of `{}`", thing.name)),
+            (None, None) => String::new(),
+        };
         Row {
             frame: (frame.0.to_string(), frame.1.to_string()),
-            platform: platform.unwrap_or_default(),
+            platform,
             unit: of_any(unit),
             range: of_any(range),
             default: words::default(device, index),
-            writing: words::writing(point),
+            writing: of_any(words::writing(device, point)),
+            is_written_elsewhere: point.write.as_ref().is_some_and(|write| write.at != point.at),
             kept: if point.persistent { "EEPROM" } else { "" },
+            living: of_any(words::living(device, &point.when)),
         }
     }
 
-    fn cells(self, page: &Page<'_>, sharing: &[PointIndex]) -> [String; 9] {
+    fn cells(mut self, page: &Page<'_>, sharing: &[PointIndex]) -> [String; 10] {
         let shown: Vec<&str> = sharing
             .iter()
             .filter_map(|index| page.entities[*index].as_ref())
@@ -131,10 +135,16 @@ impl Row {
         if let Some(also) = from_to(sharing, also) {
             places += &format!(", also {also}");
         }
+        let written_at = |index: &PointIndex| Some(page.device.points[*index].write.as_ref()?.at);
+        if self.is_written_elsewhere {
+            let written_at = from_to(sharing, written_at);
+            self.writing.push_str(&written_at.map(|at| format!(", at {at}")).unwrap_or_default());
+        }
         [
             page.names(sharing),
             words::together_plain(&shown),
             self.platform,
+            self.living,
             self.unit,
             self.range,
             self.default,
@@ -146,14 +156,15 @@ impl Row {
 }
 
 /// The first and the last place of points that share a row: `holding 51 to 58`.
-fn from_to(sharing: &[PointIndex], place: impl Fn(&PointIndex) -> Option<Address>) -> Option<String> {
+pub fn from_to(sharing: &[usize], place: impl Fn(&usize) -> Option<Address>) -> Option<String> {
     let (first, last) = (place(sharing.first()?)?, place(sharing.last()?)?);
     if first == last {
         return Some(first.to_string());
     }
     let told = last.to_string();
     let same_table = format!("{} ", first.span.table());
-    Some(format!("{first} to {}", told.strip_prefix(&same_table).unwrap_or(&told)))
+    let to = if sharing.len() == 2 { "and" } else { "to" };
+    Some(format!("{first} {to} {}", told.strip_prefix(&same_table).unwrap_or(&told)))
 }
 
 /// What is too long for a cell.

@@ -3,7 +3,8 @@
 use super::super::json::usual_registers;
 use crate::engine::codec::{self, Resolved};
 use crate::engine::device::{
-    Case, Decimals, Device, Encoding, Form, Kind, Names, Platform, Point, PointIndex, Unit, Write, WriteRule,
+    Case, Condition, Decimals, Device, Encoding, Form, Kind, Names, Platform, Point, PointIndex, Unit, Write,
+    WriteRule,
 };
 use crate::engine::homeassistant::{Entity, entity};
 use crate::engine::time::Duration;
@@ -12,18 +13,92 @@ use crate::engine::value::{Decimal, Missing, Reading};
 /// Lists of more names than this get a table of their own.
 pub const NAMES_IN_CELL: usize = 4;
 
+/// While what a point lives, in a cell: of long lists only where they stand.
+pub fn living(device: &Device, when: &[Condition]) -> String {
+    let long = |condition: &&Condition| condition.values.len() > NAMES_IN_CELL;
+    let when = merged(when);
+    let (long, short): (Vec<_>, Vec<_>) = when.iter().partition(long);
+    let mut parts: Vec<String> =
+        short.into_iter().map(|short| condition(device, std::slice::from_ref(short))).collect();
+    parts.extend(
+        long.into_iter()
+            .map(|long| format!("`{}` [allows it](#operating-modes)", device.points[long.point].name)),
+    );
+    parts.join(", and ")
+}
+
 /// What Home Assistant makes of a point while the device is set as it leaves the factory; of a point
-/// that then has no reading, what it makes of it in the first case that has one.
+/// that has none of its own then, what it makes of it in the first of the other settings that decide.
 pub fn entity_of(device: &Device, index: PointIndex) -> Option<Entity> {
-    let usual = usual_registers(device, index);
-    entity(device, index, &usual).or_else(|| match &device.points[index].encoding {
-        Encoding::Plain(_) => None,
-        Encoding::Cases { by, cases } => cases.iter().find_map(|case| {
-            let mut known = usual.clone();
-            known[*by] = Some(case.key);
-            entity(device, index, &known)
-        }),
-    })
+    settings(device, index).iter().find_map(|known| entity(device, index, known))
+}
+
+/// What the deciding registers can hold as far as that concerns this point, the usual first.
+fn settings(device: &Device, index: PointIndex) -> Vec<Vec<Option<i128>>> {
+    const MANY: usize = 1000;
+    let point = &device.points[index];
+    let touching = device.things.iter().filter(|thing| thing.shows(index) || thing.commands_point(index));
+    let mut deciding: Vec<(PointIndex, Vec<i128>)> = Vec::new();
+    for condition in point.when.iter().chain(touching.flat_map(|thing| &thing.when)) {
+        if !deciding.iter().any(|(known, _)| *known == condition.point) {
+            let values = deciding_values(&device.points[condition.point]);
+            deciding.push((condition.point, values.into_iter().map(|(raw, _)| raw).collect()));
+        }
+    }
+    if let Encoding::Cases { by, cases } = &point.encoding {
+        deciding.retain(|(known, _)| known != by);
+        deciding.push((*by, cases.iter().map(|case| case.key).collect()));
+    }
+    let mut settings = vec![usual_registers(device, index)];
+    for (decider, values) in deciding {
+        for at in 0..settings.len() {
+            for value in &values {
+                if settings.len() < MANY {
+                    let mut other = settings[at].clone();
+                    other[decider] = Some(*value);
+                    settings.push(other);
+                }
+            }
+        }
+    }
+    settings
+}
+
+/// The values by which a point can decide about others; a flag's are `OFF` and `ON`.
+pub fn deciding_values(point: &Point) -> Vec<(i128, String)> {
+    match point.plain() {
+        Some(form) if form.kind == Kind::Bool => vec![(0, "OFF".into()), (1, "ON".into())],
+        form => form.map_or(&[][..], |form| form.names.list()).to_vec(),
+    }
+}
+
+/// While what a point or a thing lives: `mode` is `direct` or `motor`, and `enabled` is `ON`.
+pub fn condition(device: &Device, when: &[Condition]) -> String {
+    let each = |condition: &Condition| {
+        let names: Vec<String> = condition.values.iter().map(|(_, name)| format!("`{name}`")).collect();
+        format!("`{}` is {}", device.points[condition.point].name, or(&names))
+    };
+    merged(when).iter().map(each).collect::<Vec<_>>().join(", and ")
+}
+
+fn or(words: &[String]) -> String {
+    match words {
+        [] => "nothing that it can be".into(),
+        [one] => one.clone(),
+        [before @ .., last] => format!("{} or {last}", before.join(", ")),
+    }
+}
+
+/// One condition for each point: one that is named twice has to have a value of both lists.
+pub fn merged(when: &[Condition]) -> Vec<Condition> {
+    let mut merged: Vec<Condition> = Vec::new();
+    for condition in when {
+        match merged.iter_mut().find(|known| known.point == condition.point) {
+            Some(known) => known.values.retain(|(raw, _)| condition.holds(*raw)),
+            None => merged.push(condition.clone()),
+        }
+    }
+    merged
 }
 
 /// A switch, a number: Home Assistant's own word for it, and how several are called.
@@ -69,7 +144,13 @@ pub fn range(device: &Device, index: PointIndex, form: &Form, table: Option<&str
         (None, _) => codes(form.names.list().iter().map(|(_, name)| name.as_str())),
     };
     let mut parts = Vec::new();
+    if form.elements > 1 {
+        parts.push(format!("{} values, [on request](#on-request)", form.elements));
+    }
     match (form.kind, &form.names) {
+        (Kind::Bool, _) if point.event.is_some() => {
+            parts.extend(point.event.iter().map(|event| format!("[event](#events) `{event}`")));
+        }
         (Kind::Bool, _) => parts.push("`ON`, `OFF`".to_string()),
         (_, Names::All(_)) => parts.push(listed),
         (kind, _) if kind.is_text() => parts.push(text(kind)),
@@ -182,20 +263,24 @@ pub fn place(point: &Point) -> String {
     }
 }
 
-/// Whether it can be written, and how.
-pub fn writing(point: &Point) -> String {
-    let Some(Write { at, with, rule, .. }) = &point.write else { return "no".into() };
+/// Whether it can be written, and how; where, if that is another place, stands in its row.
+pub fn writing(device: &Device, point: &Point) -> String {
+    let Some(Write { with, rule, settle, on_change, .. }) = &point.write else { return "no".into() };
     let mut words = vec![match rule {
         WriteRule::Any | WriteRule::Range { .. } => "yes".to_string(),
         WriteRule::Names(names) => format!("only {}", codes(names.iter().map(String::as_str))),
         WriteRule::Press { .. } => "press".into(),
     }];
-    if *at != point.at {
-        words.push(format!("at {at}"));
+    words.extend(with.map(|function| format!("with function {} only", function.code())));
+    let names = point.plain().map_or(&[][..], |form| form.names.list());
+    let between = on_change.and_then(|raw| names.iter().find(|(value, _)| *value == raw));
+    words.extend(between.map(|(_, name)| format!("the same again with `{name}` between")));
+    if !settle.is_zero() {
+        words.push(format!("read back after {}", duration(*settle)));
     }
-    if let Some(function) = with {
-        words.push(format!("with function {} only", function.code()));
-    }
+    words.extend(
+        point.heartbeat.map(|time| format!("repeated by busker within `{}`", device.points[time].name)),
+    );
     words.join(", ")
 }
 
@@ -230,24 +315,24 @@ pub fn together(names: &[&str]) -> String {
 
 /// The same for what people read: Relay 1 to 4.
 pub fn together_plain(names: &[&str]) -> String {
-    let told = |run: &Run| match (run.names.as_slice(), run.last_number) {
-        ([first, .., _], Some(last)) if first.ends_with(|c: char| c.is_ascii_digit()) => {
-            format!("{first} to {last}")
+    let told = |run: &Run| match (run.names.as_slice(), run.last_number()) {
+        ([first, .., last], Some(number)) if last.ends_with(&number.to_string()) => {
+            let to = if run.names.len() == 2 { "and" } else { "to" };
+            format!("{first} {to} {number}")
         }
         _ => run.told(str::to_string),
     };
     folded(names).iter().map(told).collect::<Vec<_>>().join(", ")
 }
 
-/// Names in a row.
+/// Names in a row, of which each has one number that is one more than in the name before.
 struct Run<'n> {
-    /// Before and behind the first number.
-    frame: (&'n str, &'n str),
     names: Vec<&'n str>,
-    last_number: Option<u32>,
+    /// Which of the numbers; not known of a single name.
+    counts: Option<usize>,
 }
 
-impl Run<'_> {
+impl<'n> Run<'n> {
     fn told(&self, show: impl Fn(&str) -> String) -> String {
         match self.names.as_slice() {
             [one] => show(one),
@@ -256,24 +341,69 @@ impl Run<'_> {
             [] => String::new(),
         }
     }
+
+    fn last_number(&self) -> Option<u32> {
+        pieces(self.names.last()?).get(self.counts?)?.1
+    }
+
+    /// Which number `name` counts on, if it is the next of the run.
+    fn goes_on_with(&self, name: &str) -> Option<usize> {
+        let (last, next) = (pieces(self.names.last()?), pieces(name));
+        if last.len() != next.len() {
+            return None;
+        }
+        let differs = |at: &usize| last[*at] != next[*at];
+        let mut different = (0..last.len()).filter(differs);
+        let (at, None) = (different.next()?, different.next()) else { return None };
+        let (before, after) = (last[at], next[at]);
+        let is_next = before.0 == after.0 && before.1.and_then(|number| number.checked_add(1)) == after.1;
+        (is_next && after.1.is_some() && self.counts.is_none_or(|counts| counts == at)).then_some(at)
+    }
 }
 
 fn folded<'n>(names: &[&'n str]) -> Vec<Run<'n>> {
     let mut runs: Vec<Run<'n>> = Vec::new();
     for &name in names {
-        let (frame, number) = around_first_number(name);
-        let follows = |run: &&mut Run| {
-            run.frame == frame && run.last_number.is_some_and(|last| number == last.checked_add(1))
-        };
-        match runs.iter_mut().find(follows) {
-            Some(run) => {
-                run.names.push(name);
-                run.last_number = number;
+        let next = runs.iter().enumerate().find_map(|(at, run)| Some((at, run.goes_on_with(name)?)));
+        match next {
+            Some((at, counts)) => {
+                runs[at].names.push(name);
+                runs[at].counts = Some(counts);
             }
-            None => runs.push(Run { frame, names: vec![name], last_number: number }),
+            None => runs.push(Run { names: vec![name], counts: None }),
         }
     }
     runs
+}
+
+/// Texts, each with the number behind it; the last may have none.
+fn pieces(name: &str) -> Vec<(&str, Option<u32>)> {
+    let mut pieces = Vec::new();
+    let mut rest = name;
+    while let ((before, behind), Some(number)) = around_first_number(rest) {
+        pieces.push((before, Some(number)));
+        rest = behind;
+    }
+    pieces.push((rest, None));
+    pieces
+}
+
+/// `name` with N for the number of what it belongs to, which is called `frame.0` and then that number.
+/// What does not have that in its name has N for its first number, if it is the same.
+pub fn with_n(name: &str, (before, number): (&str, u32)) -> String {
+    let own = format!("{before}{number}");
+    let is_whole = |at: &usize| {
+        let behind = &name[at + own.len()..];
+        let begins = *at == 0 || name[..*at].ends_with('_');
+        begins && !behind.starts_with(|c: char| c.is_ascii_digit())
+    };
+    if let Some((at, _)) = name.match_indices(&own).find(|(at, _)| is_whole(at)) {
+        return format!("{}{before}N{}", &name[..at], &name[at + own.len()..]);
+    }
+    match around_first_number(name) {
+        ((before, behind), Some(first)) if first == number => format!("{before}N{behind}"),
+        _ => name.to_string(),
+    }
 }
 
 /// What stands before and behind the first number of a name, and that number.
@@ -283,6 +413,18 @@ pub fn around_first_number(name: &str) -> ((&str, &str), Option<u32>) {
     let rest = &name[start..];
     let end = start + rest.find(|c| !is_digit(c)).unwrap_or(rest.len());
     ((&name[..start], &name[end..]), name[start..end].parse().ok())
+}
+
+/// A table. A column in which nothing stands only makes the others narrow, and is left away.
+pub fn table<const N: usize>(titles: &[&str; N], rows: &[[String; N]], text: &mut String) {
+    let filled: Vec<usize> = (0..N).filter(|at| rows.iter().any(|row| !row[*at].is_empty())).collect();
+    let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
+    text.push_str(&line(filled.iter().map(|column| titles[*column].to_string()).collect()));
+    text.push_str(&format!("|{}\n", "---|".repeat(filled.len())));
+    for row in rows {
+        text.push_str(&line(filled.iter().map(|column| cell(&row[*column])).collect()));
+    }
+    text.push('\n');
 }
 
 /// A bar would end the cell.
@@ -316,6 +458,10 @@ mod tests {
                 "`a_1_on` and `a_2_on`, `a_1_off` and `a_2_off`",
             ),
             (vec!["relay_1", "relay_3"], "`relay_1`, `relay_3`"),
+            (
+                vec!["input_1_for_relay_1", "input_1_for_relay_2", "input_2_for_relay_2"],
+                "`input_1_for_relay_1` and `input_1_for_relay_2`, `input_2_for_relay_2`",
+            ),
         ] {
             assert_eq!(together(&names), expected);
         }
@@ -324,6 +470,22 @@ mod tests {
             together_plain(&["Meter 1 digits", "Meter 2 digits"]),
             "Meter 1 digits and Meter 2 digits"
         );
+        assert_eq!(together_plain(&["Relay 1", "Relay 2"]), "Relay 1 and 2");
+        assert_eq!(together_plain(&["Input 1 of relay 1", "Input 1 of relay 2"]), "Input 1 of relay 1 and 2");
+    }
+
+    #[test]
+    fn what_belongs_to_a_number_has_n_in_its_place() {
+        for (name, expected) in [
+            ("relay_1_hand", "relay_N_hand"),
+            ("input_1_leak_for_relay_1", "input_1_leak_for_relay_N"),
+            ("relay_12_hand", "relay_12_hand"),
+            ("valve_1", "valve_N"),
+            ("valve_2", "valve_2"),
+            ("watchdog", "watchdog"),
+        ] {
+            assert_eq!(with_n(name, ("relay_", 1)), expected);
+        }
     }
 
     #[test]
