@@ -7,6 +7,7 @@
 
 mod coverage;
 mod discovery;
+mod inline;
 mod manual;
 mod points;
 mod properties;

@@ -10,7 +10,7 @@ use crate::engine::configuration::words::{
     BaudRate, BrokerUrl, HostPort, Listen, Name, NoTls, Part, StopBits, Topic, Unit,
 };
 use crate::engine::device::Poll;
-use crate::engine::profile::file::{Intervals, Point, Presentation, Wire};
+use crate::engine::profile::file::{Intervals, Point, Presentation, Thing, Wire};
 use crate::engine::settings::{OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
 use crate::engine::value::Decimal;
@@ -115,6 +115,8 @@ record! {
         /// With a profile: wishes for its points, by their names. Without: the points themselves, in the
         /// form of a profile.
         points: Option<Points>,
+        /// Without a profile: things made of several points, in the form of a profile.
+        things: Option<Later<Map<String, Thing>>>,
         /// Without a profile: how the device behaves on the wire, in the form of a profile.
         wire: Option<Later<Wire>>,
         /// Without a profile: how the points look, in the form of a profile.

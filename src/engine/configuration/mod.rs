@@ -14,7 +14,7 @@ use crate::engine::configuration::file::Configuration;
 use crate::engine::configuration::words::{HostPort, Listen, Name, Part, Unit};
 use crate::engine::device::Device;
 use crate::engine::profile::file::Intervals;
-use crate::engine::profile::{self, Library};
+use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
     Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password, Settings, Wanted,
 };
@@ -347,6 +347,7 @@ impl Resolver<'_> {
         let mut device = match &file.profile {
             Some(profile) => {
                 let own = [
+                    ("things", file.things.as_ref().map(|things| &things.node)),
                     ("wire", file.wire.as_ref().map(|wire| &wire.node)),
                     ("home_assistant", file.home_assistant.as_ref().map(|looks| &looks.node)),
                 ];
@@ -388,9 +389,13 @@ impl Resolver<'_> {
             self.faults.add(&file.place, "this device has neither a `profile` nor `points` of its own");
             return None;
         };
-        let wire = file.wire.as_ref().map(|wire| &wire.node);
-        let looks = file.home_assistant.as_ref().map(|looks| &looks.node);
-        profile::load_inline(&points.0, wire, looks, self.library, &mut self.faults)
+        let inline = Inline {
+            points: &points.0,
+            things: file.things.as_ref().map(|things| &things.node),
+            wire: file.wire.as_ref().map(|wire| &wire.node),
+            home_assistant: file.home_assistant.as_ref().map(|looks| &looks.node),
+        };
+        profile::load_inline(&inline, self.library, &mut self.faults)
     }
 
     fn intervals(&mut self, file: &Intervals, device: &mut Device) {

@@ -56,7 +56,13 @@ impl Library {
         let Some(profile) = read::<Profile>(&node, faults) else {
             // Something of the head is wrong. The points are checked all the same, so that all
             // faults are told at once.
-            load_inline(node.get("points")?, node.get("wire"), node.get("home_assistant"), self, faults);
+            let inline = Inline {
+                points: node.get("points")?,
+                things: node.get("things"),
+                wire: node.get("wire"),
+                home_assistant: node.get("home_assistant"),
+            };
+            load_inline(&inline, self, faults);
             return None;
         };
         if let Some(id) = id.filter(|id| profile.device.value != *id) {
@@ -69,19 +75,23 @@ impl Library {
     }
 }
 
-/// A device whose points stand in the gateway's configuration, in the profile's form. `wire` and
-/// `home_assistant` are the values of those keys beside `points`, if they are there.
+/// The sections of a device whose points stand in the gateway's configuration: the values of these
+/// keys, if they are there.
+pub struct Inline<'n> {
+    pub points: &'n Node,
+    pub things: Option<&'n Node>,
+    pub wire: Option<&'n Node>,
+    pub home_assistant: Option<&'n Node>,
+}
+
+/// A device whose points stand in the gateway's configuration, in the profile's form.
 ///
 /// `None` if nothing can be made of it; as everywhere, a device that comes with faults is not to be used.
-pub fn load_inline(
-    points: &Node,
-    wire: Option<&Node>,
-    home_assistant: Option<&Node>,
-    library: &Library,
-    faults: &mut Faults,
-) -> Option<Device> {
-    let wire = wire.and_then(|node| read(node, faults));
-    let home_assistant = home_assistant.and_then(|node| read(node, faults)).unwrap_or_default();
+pub fn load_inline(inline: &Inline<'_>, library: &Library, faults: &mut Faults) -> Option<Device> {
+    let points = inline.points;
+    let wire = inline.wire.and_then(|node| read(node, faults));
+    let things = inline.things.and_then(|node| read(node, faults)).unwrap_or_default();
+    let home_assistant = inline.home_assistant.and_then(|node| read(node, faults)).unwrap_or_default();
     let profile = Profile {
         place: points.named_at().clone(),
         device: At::nowhere("inline".into()),
@@ -91,7 +101,7 @@ pub fn load_inline(
         identify: None,
         wire,
         points: read(points, faults)?,
-        things: Map::default(),
+        things,
         left_out: Map::default(),
         home_assistant,
     };

@@ -193,7 +193,8 @@ fn points_may_stand_in_the_configuration() {
     );
     let node = parse(&source, &mut faults).expect("a map");
     let points = node.get("points").expect("the key");
-    let device = load_inline(points, None, None, &Library::shipped(), &mut faults).expect("a device");
+    let inline = Inline { points, things: None, wire: None, home_assistant: None };
+    let device = load_inline(&inline, &Library::shipped(), &mut faults).expect("a device");
     assert!(faults.is_empty(), "{faults}");
     assert_eq!(device.profile, "inline");
     assert!(matches!(
