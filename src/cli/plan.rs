@@ -1,9 +1,12 @@
 //! `busker plan`: what each device will be asked, as a table.
 
+use std::path::Path;
+
 use serde::Serialize;
 
 use super::configuration::ConfigurationArgs;
 use super::output::{print, print_json};
+use super::profiles::load_file;
 use super::{Failure, configuration};
 use crate::engine::device::Device;
 use crate::engine::plan::{self, Cost, Read};
@@ -19,15 +22,15 @@ const TURNAROUND: Duration = Duration::from_millis(5);
 /// One line for each read: how often, the registers, and the points that it brings.
 #[derive(clap::Args, Debug)]
 #[command(after_help = "Examples:\n  busker plan --config /etc/busker/busker.yaml\n  \
-    busker plan --profile metz-connect/mr-ai8")]
+    busker plan --profile metz-connect/mr-ai8\n  busker plan --profile my-device.yaml")]
 pub struct Args {
     #[command(flatten)]
     configuration: ConfigurationArgs,
     /// Only this device of the configuration
     #[arg(long, value_name = "NAME")]
     device: Option<String>,
-    /// The plan of a profile on a line of 19200 8E1, without a configuration
-    #[arg(long, value_name = "ID", conflicts_with_all = ["config", "device"])]
+    /// The plan of a profile, or of a profile's file, on a line of 19200 8E1, without a configuration
+    #[arg(long, value_name = "ID|FILE", conflicts_with_all = ["config", "device"])]
     profile: Option<String>,
     /// Tell it as JSON
     #[arg(long)]
@@ -50,6 +53,8 @@ struct ReadRow {
     first: u16,
     last: u16,
     points: Vec<String>,
+    /// The points that decide whether it is sent at all.
+    sleeps_by: Vec<String>,
     /// How long it takes, in milliseconds.
     wire_ms: f64,
 }
@@ -70,11 +75,15 @@ pub fn run(args: Args) -> Result<(), Failure> {
         text.push_str(&plan.table);
         text.push('\n');
     }
-    print(text.trim_end_matches('\n'))?;
-    print("\n")
+    print(&format!("{}\n", text.trim_end_matches('\n')))
 }
 
 fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
+    let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
+    let cost = Cost::of(&Link::Serial { path: String::new(), line }, TURNAROUND);
+    if id.ends_with(".yaml") {
+        return Ok(plan_of(id, &load_file(Path::new(id))?, cost));
+    }
     let library = Library::shipped();
     if !library.contains(id) {
         return Err(Failure::wrong(format!(
@@ -83,9 +92,7 @@ fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
         )));
     }
     let device = library.load(id).map_err(configuration::faults)?;
-    let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
-    let link = Link::Serial { path: String::new(), line };
-    Ok(plan_of(id, &device, Cost::of(&link, TURNAROUND)))
+    Ok(plan_of(id, &device, cost))
 }
 
 fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
@@ -117,6 +124,7 @@ fn plan_of(name: &str, device: &Device, cost: Cost) -> DevicePlan {
         first: read.span.first(),
         last: read.span.last(),
         points: read.points.iter().map(|(point, _)| device.points[*point].name.clone()).collect(),
+        sleeps_by: read.sleeps_by(device).iter().map(|point| device.points[*point].name.clone()).collect(),
         wire_ms: cost.of_read(read.span) as f64 / 1000.0,
     };
     DevicePlan {

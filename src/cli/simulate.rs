@@ -6,10 +6,9 @@ use std::sync::Arc;
 
 use anyhow::Context;
 
-use super::profiles::add_shared_files_near;
-use super::{Failure, configuration, output};
+use super::profiles::load_file;
+use super::{Failure, output};
 use crate::edge::shutdown::Signals;
-use crate::engine::profile::Library;
 use crate::engine::time::Duration;
 use crate::simulator::device::parse_unit;
 use crate::simulator::script::{parse_duration, parse_script};
@@ -105,7 +104,8 @@ pub fn run(args: Args) -> Result<(), Failure> {
         }
         None => Vec::new(),
     };
-    let profiles = args.profile.iter().map(load).collect::<Result<Vec<_>, Failure>>()?;
+    let plain = |(file, unit): &(PathBuf, u8)| Ok((Plain::new(load_file(file)?), *unit));
+    let profiles = args.profile.iter().map(plain).collect::<Result<Vec<_>, Failure>>()?;
     let options = Options {
         line: LineSettings { baud: args.baud, parity: args.parity },
         turnaround: args.turnaround,
@@ -137,18 +137,6 @@ pub fn run(args: Args) -> Result<(), Failure> {
     obey_standard_input(&simulation)?;
     runtime.block_on(signals.wait());
     Ok(())
-}
-
-/// The device of a profile's file, as `busker profiles check` reads it.
-fn load((file, unit): &(PathBuf, u8)) -> Result<(Plain, u8), Failure> {
-    let shown = file.display().to_string();
-    let bytes = std::fs::read(file)
-        .with_context(|| format!("cannot read the profile `{shown}`"))
-        .map_err(Failure::WrongInput)?;
-    let mut library = Library::shipped();
-    add_shared_files_near(&mut library, file)?;
-    let device = library.check(&shown, &bytes).map_err(configuration::faults)?;
-    Ok((Plain::new(device), *unit))
 }
 
 fn tell(told: &Told) {

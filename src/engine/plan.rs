@@ -45,6 +45,19 @@ impl Read {
         middle.and_then(|(before, after)| across(*before, *after)).into_iter().collect()
     }
 
+    /// The points that decide whether this read is sent: it is not while none of its points lives.
+    /// Empty if one of them always does.
+    pub fn sleeps_by(&self, device: &Device) -> Vec<PointIndex> {
+        let conditions = || self.points.iter().map(|(point, _)| &device.points[*point].when);
+        if conditions().any(Vec::is_empty) {
+            return Vec::new();
+        }
+        let mut deciding: Vec<PointIndex> = conditions().flatten().map(|condition| condition.point).collect();
+        deciding.sort_unstable();
+        deciding.dedup();
+        deciding
+    }
+
     /// The runs of addresses inside the span that no point needs.
     pub fn gaps(&self) -> Vec<Span> {
         let mut gaps = Vec::new();
@@ -252,7 +265,16 @@ impl fmt::Display for Table<'_> {
                 1 => write!(f, "{}", name(0))?,
                 count => write!(f, "{} .. {} ({count})", name(0), name(count - 1))?,
             }
-            writeln!(f, "{}", if read.alone { "  alone: reading changes it" } else { "" })?;
+            write!(f, "{}", if read.alone { "  alone: reading changes it" } else { "" })?;
+            let deciding = read.sleeps_by(self.device);
+            let name = |at: usize| self.device.points[deciding[at]].name.as_str();
+            match deciding.len() {
+                0 => {}
+                1 => write!(f, "  only while {} allows it", name(0))?,
+                2 => write!(f, "  only while {} or {} allows it", name(0), name(1))?,
+                count => write!(f, "  only while {} .. {} allow it", name(0), name(count - 1))?,
+            }
+            writeln!(f)?;
         }
         Ok(())
     }

@@ -4,7 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::engine::address::Table as RegisterTable;
-use crate::engine::device::{Forbidden, Limits, Point, Wire};
+use crate::engine::device::{Condition, Forbidden, Limits, Point, Wire};
 use crate::engine::settings::Parity;
 use crate::engine::test_device::device_of;
 
@@ -44,6 +44,23 @@ fn near_points_share_a_read_and_far_ones_do_not() {
     check(&device(&[(0, 1), (200, 1)], |_| {}), &[], &["input 0", "input 200"]);
     check(&device(&[(0, 1), (4, 1)], |wire| wire.limits.gap = Some(2)), &[], &["input 0", "input 4"]);
     check(&device(&[(0, 1), (1, 1)], |wire| wire.limits.gap = Some(0)), &[], &["input 0..1"]);
+}
+
+#[test]
+fn a_read_sleeps_while_none_of_its_points_lives() {
+    let mut device = device(&[(0, 1), (200, 1), (201, 1), (400, 1), (401, 1)], |_| {});
+    for living in [2, 3, 4] {
+        device.points[living].when = vec![Condition { point: 0, values: vec![(1, "on".into())] }];
+    }
+    let reads = plan(&device, cost(), &[]);
+    let deciding: Vec<Vec<PointIndex>> = reads.iter().map(|read| read.sleeps_by(&device)).collect();
+    assert_eq!(deciding, [vec![], vec![], vec![0]]);
+    let table = Table { device: &device, reads: &reads }.to_string();
+    assert_eq!(
+        table.lines().filter(|line| line.ends_with("  only while p0 allows it")).count(),
+        1,
+        "{table}"
+    );
 }
 
 #[test]

@@ -12,7 +12,7 @@ use clap::Subcommand;
 use super::configuration::add_profiles;
 use super::output::{self, Table};
 use super::{Failure, configuration};
-use crate::engine::device::{Device, Encoding, Point, Poll, Unit};
+use crate::engine::device::{Condition, Device, Encoding, Point, PointIndex, Poll, Unit, WriteRule};
 use crate::engine::profile::{self, Library};
 use crate::engine::yaml::list_of_choices;
 
@@ -108,7 +108,7 @@ fn show(library: &Library, id: &str, json: bool) -> Result<(), Failure> {
 
 fn check(mut library: Library, files: &[PathBuf]) -> Result<(), Failure> {
     let mut faults = Vec::new();
-    let mut good = Table::new();
+    let mut good = String::new();
     for file in files {
         let shown = file.display().to_string();
         let bytes = fs::read(file)
@@ -119,19 +119,39 @@ fn check(mut library: Library, files: &[PathBuf]) -> Result<(), Failure> {
         let found = if is_shared {
             library.check_shared(&shown, &bytes).map(|cases| format!("{cases} cases"))
         } else {
-            library
-                .check(&shown, &bytes)
-                .map(|device| format!("{}, {} points", device.profile, device.points.len()))
+            library.check(&shown, &bytes).map(|device| summary(&device))
         };
         match found {
-            Ok(what) => {
-                good.row([format!("{shown}:"), format!("no fault ({what})")]);
-            }
+            Ok(what) => good += &format!("{shown}: no fault ({what})\n"),
             Err(found) => faults.extend(found),
         }
     }
-    output::print(&good.render())?;
+    output::print(&good)?;
     if faults.is_empty() { Ok(()) } else { Err(configuration::faults(faults)) }
+}
+
+/// `acme/ra8, 57 points, 2 things`
+fn summary(device: &Device) -> String {
+    let counted = |count: usize, one: &str| match count {
+        1 => format!("1 {one}"),
+        count => format!("{count} {one}s"),
+    };
+    let mut parts = vec![device.profile.clone(), counted(device.points.len(), "point")];
+    if !device.things.is_empty() {
+        parts.push(counted(device.things.len(), "thing"));
+    }
+    parts.join(", ")
+}
+
+/// The device of a profile's file that need not be in any folder of profiles.
+pub fn load_file(file: &Path) -> Result<Device, Failure> {
+    let shown = file.display().to_string();
+    let bytes = fs::read(file)
+        .with_context(|| format!("cannot read the profile `{shown}`"))
+        .map_err(Failure::WrongInput)?;
+    let mut library = Library::shipped();
+    add_shared_files_near(&mut library, file)?;
+    library.check(&shown, &bytes).map_err(configuration::faults)
 }
 
 /// The files in `shared/` beside a profile, or beside its manufacturer's folder.
@@ -155,16 +175,32 @@ fn schema() -> Result<String, Failure> {
 /// What a person wants to know of a profile on one page.
 fn page(device: &Device) -> String {
     let mut table = Table::new();
-    table.row(["point", "at", "type", "unit", "access", "poll"]);
+    table.row(["point", "at", "type", "unit", "access", "poll", "only while", "remarks"]);
     for point in &device.points {
         let (kind, unit) = match &point.encoding {
-            Encoding::Plain(form) => (form.kind.name(), unit_text(device, &form.unit)),
-            Encoding::Cases { by, .. } => (format!("by {}", device.points[*by].name), String::new()),
+            Encoding::Plain(form) => {
+                let kind = match (form.elements, &point.refers) {
+                    (1, None) => form.kind.name(),
+                    (1, Some(span)) => format!("refers to {span}"),
+                    (elements, _) => format!("{elements} × {}", form.kind.name()),
+                };
+                (kind, unit_text(device, &form.unit))
+            }
+            Encoding::Cases { by, .. } => {
+                let by = &device.points[*by];
+                let how = if by.refers.is_some() { "like" } else { "by" };
+                (format!("{how} {}", by.name), String::new())
+            }
         };
         let at = point.at.to_string();
         let access = access(point).to_string();
-        let poll = if point.poll == Poll::Never { String::new() } else { point.poll.name().into() };
-        table.row([point.name.clone(), at, kind, unit, access, poll]);
+        let poll = match point.poll {
+            Poll::Never if point.is_read_on_request() => "on request".into(),
+            Poll::Never => String::new(),
+            poll => poll.name().into(),
+        };
+        let (when, remarks) = (when_text(device, &point.when), remarks(device, point));
+        table.row([point.name.clone(), at, kind, unit, access, poll, when, remarks]);
     }
     let mut page = format!(
         "{}: {} {}\n{}\n\n{}",
@@ -174,6 +210,7 @@ fn page(device: &Device) -> String {
         device.source.trim(),
         table.render()
     );
+    page += &things_text(device);
     if !device.left_out.is_empty() {
         page += "\nleft out:\n";
     }
@@ -181,6 +218,76 @@ fn page(device: &Device) -> String {
         page += &format!("  {}: {}\n", left_out.span, left_out.reason.trim());
     }
     page
+}
+
+/// `mode is direct or motor, enabled is ON`
+fn when_text(device: &Device, when: &[Condition]) -> String {
+    let each = |condition: &Condition| {
+        let names: Vec<&str> = condition.values.iter().map(|(_, name)| name.as_str()).collect();
+        format!("{} is {}", device.points[condition.point].name, names.join(" or "))
+    };
+    when.iter().map(each).collect::<Vec<_>>().join(", ")
+}
+
+/// What is unusual about a point.
+fn remarks(device: &Device, point: &Point) -> String {
+    let mut remarks = Vec::new();
+    if point.persistent {
+        remarks.push("EEPROM".to_string());
+    }
+    if point.read_clears {
+        remarks.push("reading clears it".into());
+    }
+    remarks.extend(point.event.as_ref().map(|event| format!("event {event}")));
+    if let Some(write) = &point.write {
+        if write.at != point.at {
+            remarks.push(format!("written at {}", write.at));
+        }
+        if matches!(write.rule, WriteRule::Press { .. }) {
+            remarks.push("button".into());
+        }
+        if !write.settle.is_zero() {
+            remarks.push(format!("settles in {} ms", write.settle.as_millis()));
+        }
+        let names = point.plain().map_or(&[][..], |form| form.names.list());
+        let between = write.on_change.and_then(|raw| names.iter().find(|(value, _)| *value == raw));
+        remarks.extend(between.map(|(_, name)| format!("acts on change, {name} between")));
+    }
+    remarks.extend(point.heartbeat.map(|time| format!("heartbeat within {}", device.points[time].name)));
+    if device.wire.watchdog.is_some_and(|watchdog| device.points[watchdog].name == point.name) {
+        remarks.push("watchdog".into());
+    }
+    remarks.join(", ")
+}
+
+/// Each thing with what makes its states and what its commands write.
+fn things_text(device: &Device) -> String {
+    let row = |row: &[(PointIndex, String)], sign: &str| {
+        let each = row.iter().map(|(point, value)| format!("{}{sign}{value}", device.points[*point].name));
+        each.collect::<Vec<_>>()
+    };
+    let mut text = String::new();
+    for thing in &device.things {
+        let when = match when_text(device, &thing.when) {
+            when if when.is_empty() => when,
+            when => format!(", only while {when}"),
+        };
+        text += &format!("\n{} {}{when}\n", thing.kind.name(), thing.name);
+        let mut table = Table::new();
+        for (word, point) in [("temperature", thing.temperature), ("target", thing.target)] {
+            if let Some(point) = point {
+                table.row(["", word, &device.points[point].name]);
+            }
+        }
+        for state in &thing.states {
+            table.row(["", &format!("is {}", state.name), &row(&state.row, " is ").join(", ")]);
+        }
+        for command in &thing.commands {
+            table.row(["", &format!("do {}", command.name), &row(&command.orders, " = ").join(", then ")]);
+        }
+        text += &table.render();
+    }
+    text
 }
 
 fn unit_text(device: &Device, unit: &Unit) -> String {
@@ -227,12 +334,46 @@ mod tests {
         }
     }
 
+    /// The page of a profile has these lines, whatever the widths of its columns.
+    #[track_caller]
+    fn check_page(file: &str, expected: &[&str]) {
+        let page = page(&load_file(Path::new(file)).expect("a good profile"));
+        let words = |line: &str| line.split_whitespace().collect::<Vec<_>>().join(" ");
+        let lines: Vec<String> = page.lines().map(words).collect();
+        for expected in expected {
+            assert!(lines.iter().any(|line| line == expected), "{expected:?} is not in\n{page}");
+        }
+    }
+
     #[test]
-    fn the_example_of_the_profile_language_is_a_good_profile() {
-        let page = fs::read_to_string("device-profiles/README.md").expect("the page");
-        let example = page.split("```yaml\n").nth(1).and_then(|rest| rest.split("```").next());
-        let device = Library::shipped().check("README.md", example.expect("an example").as_bytes());
-        assert_eq!(device.map(|device| device.profile), Ok("acme/ra8".into()));
+    fn a_page_shows_modes_things_events_and_arrays() {
+        check_page(
+            "tests/transcripts/damper.yaml",
+            &[
+                "relay coil 0 bool rw fast mode is direct",
+                "drive holding 1 u16 rw fast mode is motor settles in 100 ms, heartbeat within receive_time",
+                "cover damper, only while mode is motor",
+                "is opening position is running, drive is open",
+                "do close drive = close",
+                "do press drive = open, then alarm = ok",
+            ],
+        );
+        check_page(
+            "tests/transcripts/blind.yaml",
+            &[
+                "relay discrete 8..9 u16 rw fast written at coil 2..3, settles in 600 ms",
+                "order holding 1.0..7 u16 rw fast acts on change, locked between",
+                "pressed input 0.0 bool r fast event pressed",
+            ],
+        );
+        check_page(
+            "tests/transcripts/recorder.yaml",
+            &[
+                "curve input 10..14 5 × i16 V r on request recording is stopped",
+                "of holding 1 refers to input 1..9 rw slow",
+                "minimum input 3 like of r slow",
+            ],
+        );
     }
 
     fn shown(id: &str, point: &str) -> serde_json::Value {
