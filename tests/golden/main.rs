@@ -62,23 +62,6 @@ fn home_assistant_is_told_what_a_person_wants_to_see() {
 }
 
 #[test]
-fn the_example_in_the_reference_is_a_profile() {
-    let reference = fs::read_to_string(place("", "../../device-profiles/README.md")).expect("it is there");
-    let example = reference
-        .split("```yaml\n")
-        .skip(1)
-        .find_map(|part| part.split_once("```"))
-        .map(|(example, _)| example)
-        .filter(|example| example.contains("device: acme/ra8"))
-        .expect("the reference begins with a whole device");
-    let mut library = Library::default();
-    library.add("acme/ra8.yaml", "device-profiles/README.md", example.as_bytes().to_vec());
-    if let Err(faults) = library.load("acme/ra8") {
-        panic!("{}", faults[0]);
-    }
-}
-
-#[test]
 fn there_are_no_goldens_of_devices_that_are_gone() {
     let known: Vec<&String> = shipped().iter().map(|(id, _)| id).collect();
     for manufacturer in folders(&place("", "")) {

@@ -1,6 +1,10 @@
 //! What stands in the repository beside the program is true: the README's commands, the start
 //! configuration, its schema, the service unit.
 
+mod guide;
+#[path = "../support/mod.rs"]
+mod support;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
