@@ -7,6 +7,7 @@ use crate::engine::device::{
     Category, Device, Encoding, Identify, Platform, Point, PointIndex, Poll, WriteRule,
 };
 use crate::engine::homeassistant::{Entity, name_of_thing};
+use crate::engine::wanted;
 
 /// The page, in Markdown.
 pub fn page(device: &Device) -> String {
@@ -201,7 +202,24 @@ devices:
             let _ = writeln!(text, "    # points:            # wishes for single points");
             let _ = writeln!(text, "    #   {}: {{name: A name of your own}}", device.points[named].name);
         }
+        if let Some((setting, value)) = self.a_setting() {
+            let _ = writeln!(text, "    # settings:          # what the device keeps shall hold this");
+            let _ = writeln!(text, "    #   {setting}: {value}");
+        }
         text
+    }
+
+    /// The first setting of which the manual tells how it leaves the factory, and that.
+    fn a_setting(&self) -> Option<(&str, String)> {
+        let is_shown = |index: PointIndex| {
+            let default = words::default(self.device, index);
+            let is_told = !default.is_empty() && !default.starts_with("register ");
+            is_told.then(|| {
+                (self.device.points[index].name.as_str(), quoted_if_needed(default.trim_matches('`')))
+            })
+        };
+        let always = |index: &PointIndex| self.device.points[*index].when.is_empty();
+        wanted::settings(self.device).filter(always).find_map(is_shown)
     }
 
     fn take_care(&self, text: &mut String) {
@@ -286,7 +304,7 @@ devices:
         Some(format!(
             "**EEPROM.** {subject} kept in a memory that wears out by being written; the tables mark them. \
              busker writes them only when the value differs, and when a setting changes again and again, at \
-             most once a minute. Set them by hand, not from an automation that runs often."
+             most once a minute. Set them by hand or under `settings:`, not from an automation that runs often."
         ))
     }
 
@@ -438,6 +456,6 @@ pub fn device_name(device: &Device) -> String {
 
 fn quoted_if_needed(text: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || " -_/.".contains(c);
-    let starts = text.starts_with(|c: char| c.is_ascii_alphabetic());
+    let starts = text.starts_with(|c: char| c.is_ascii_alphabetic()) || text.parse::<f64>().is_ok();
     if starts && text.chars().all(plain) { text.into() } else { serde_json::Value::from(text).to_string() }
 }
