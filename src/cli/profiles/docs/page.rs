@@ -344,7 +344,7 @@ devices:
         selectors.sort_unstable();
         selectors.dedup();
         let points = &self.device.points;
-        selectors.retain(|index| points[*index].write.is_some() && points[*index].refers.is_none());
+        selectors.retain(|index| points[*index].write.is_some());
         if selectors.is_empty() {
             return None;
         }
