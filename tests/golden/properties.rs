@@ -98,6 +98,10 @@ fn some_state(device: &Device, index: usize, selected: &prop::sample::Index) -> 
         for condition in device.points[index].when.iter().filter(|condition| condition.point == selector) {
             possible.retain(|raw| condition.holds(*raw));
         }
+        if let Encoding::Cases { by, cases } = &device.points[index].encoding {
+            let has_reading = |raw: &i128| cases.iter().any(|case| case.key == *raw && case.form.is_some());
+            possible.retain(|raw| *by != selector || has_reading(raw));
+        }
         known[selector] = Some(*selected.get(&possible));
     }
     known

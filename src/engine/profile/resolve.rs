@@ -106,8 +106,12 @@ impl Resolution<'_, '_> {
                 self.faults.add(&name.place, message);
             }
             let is_wanted = |name: &String| wanted.iter().any(|wanted| wanted.value == *name);
-            let values = names.into_iter().filter(|(_, name)| is_wanted(name)).collect();
-            conditions.push(Condition { point, values });
+            let values: Vec<(i128, String)> = names.into_iter().filter(|(_, name)| is_wanted(name)).collect();
+            // Of two repetitions one may be named twice, by its path and by its name: both must hold.
+            match conditions.iter_mut().find(|known: &&mut Condition| known.point == point) {
+                Some(known) => known.values.retain(|value| values.contains(value)),
+                None => conditions.push(Condition { point, values }),
+            }
         }
         conditions
     }
@@ -470,7 +474,9 @@ fn referred<'a, 'f>(
 ) -> impl Iterator<Item = (i128, &'a Expanded<'f>)> {
     let is_meant = move |point: &&Expanded<'_>| {
         let at = point.at;
-        !point.is_flag && at.bits.is_none() && at.span.count() == 1 && span.contains(at.span)
+        let is_whole = !point.is_flag && at.bits.is_none() && at.span.count() == 1;
+        // What means what others mean is no meaning for others.
+        is_whole && point.file.like.is_none() && span.contains(at.span)
     };
     points.iter().filter(is_meant).map(|point| (i128::from(point.at.span.first()), point))
 }
