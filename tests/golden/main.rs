@@ -9,6 +9,7 @@ mod coverage;
 mod discovery;
 mod inline;
 mod manual;
+mod measuring;
 mod points;
 mod properties;
 mod readings;
