@@ -110,7 +110,7 @@ mod tests {
     #[test]
     fn whatever_changes_is_something_that_its_device_has() {
         for model in Model::ALL {
-            let simulation = Simulation::new(&[DeviceAt { model, unit: 1 }.into()], Options::default());
+            let simulation = Simulation::new(&[DeviceAt { model, unit: 1 }], Options::default());
             let simulation = simulation.expect("a simulation");
             for second in 0..70 {
                 for change in changes(model.id(), second) {
