@@ -141,6 +141,10 @@ impl CommandFlow {
         self.point
     }
 
+    pub fn wanted(&self) -> &str {
+        &self.wanted
+    }
+
     /// The time to settle has passed: the question that reads back.
     pub fn settled(&mut self, device: &Device) -> Call {
         if let State::Settling { field, doubt } = &self.state {

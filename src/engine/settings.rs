@@ -16,6 +16,7 @@ pub struct Settings {
     /// An unchanged value is told again after this.
     pub republish: Duration,
     pub on_broker_loss: OnBrokerLoss,
+    pub eeprom: Eeprom,
     pub buses: Vec<Bus>,
     pub devices: Vec<DeviceSettings>,
 }
@@ -67,6 +68,15 @@ pub enum OnBrokerLoss {
     Keep,
     /// Stop talking to devices that have a watchdog, so that their outputs fall to the safe state.
     StopFeeding,
+}
+
+/// How often what wears out may be written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Eeprom {
+    /// A point not more than once in this time.
+    pub interval: Duration,
+    /// All points of a device together not more often in 24 hours.
+    pub daily: u32,
 }
 
 #[derive(Clone, Debug, PartialEq)]

@@ -180,8 +180,9 @@ fn configuration_text(devices: &[DeviceAt], broker: &Broker, directory: &Path, l
         "mqtt: {{url: mqtt://127.0.0.1:{}}}
 http: {{listen: null}}
 state_dir: {}
+eeprom: {{interval: 0s, daily: 65535}}
 buses:
-  line: {{serial: {}, baud: 19200, parity: even}}
+  line: {{serial: {}, baud: 19200, parity: even, response_timeout: 10s}}
 devices:
 {devices}",
         broker.port(),

@@ -6,8 +6,8 @@ use busker::engine::device::{
 };
 use busker::engine::profile::Library;
 use busker::engine::settings::{
-    Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password, Settings,
-    Wanted,
+    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password,
+    Settings, Wanted,
 };
 use busker::engine::time::Duration;
 use busker::engine::value::Decimal;
@@ -55,6 +55,10 @@ pub fn settings(header: &str) -> Settings {
         state_dir: "/nowhere".into(),
         republish: Duration::from_secs(600),
         on_broker_loss: if says("stop feeding") { OnBrokerLoss::StopFeeding } else { OnBrokerLoss::Keep },
+        eeprom: Eeprom {
+            interval: Duration::from_secs(60),
+            daily: if says("small budget") { 4 } else { 500 },
+        },
         buses: vec![Bus {
             name: "basement".into(),
             link: if says("tcp") {

@@ -100,7 +100,7 @@ impl Bus {
         };
         let can_begin = |waiting: &Waiting| {
             let device = &devices[waiting.device];
-            device.can_take(now, waiting.target)
+            device.can_take(now, waiting.target, &waiting.wanted)
                 && !device.written_by(waiting.target).iter().any(|point| is_settling(waiting.device, *point))
         };
         let Some(waiting) = self.waiting.take_first(can_begin) else { return false };
@@ -176,6 +176,13 @@ impl Bus {
         let (device, point) = (active.device, active.flow.point());
         match step {
             Step::Ask(call) => {
+                if let (true, Some(reason)) =
+                    (call.is_write(), self.devices[device].is_spent(self.now, point))
+                {
+                    let outcome = Outcome::new(OutcomeKind::Refused, active.flow.wanted(), reason);
+                    self.end_command(active, outcome);
+                    return;
+                }
                 if call.is_write() {
                     let persistent = self.devices[device].details(point).persistent;
                     self.counters.writes += 1;

@@ -18,7 +18,7 @@ use crate::engine::identity;
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::{self, Cost, Read};
 use crate::engine::schedule::{Polls, Urgency};
-use crate::engine::settings::DeviceSettings;
+use crate::engine::settings::{DeviceSettings, Eeprom};
 use crate::engine::state::Values;
 use crate::engine::time::{Duration, Time};
 use crate::engine::upkeep::Upkeep;
@@ -90,7 +90,7 @@ pub(super) enum Polled {
 }
 
 impl DeviceState {
-    pub(super) fn new(settings: DeviceSettings, cost: Cost) -> DeviceState {
+    pub(super) fn new(settings: DeviceSettings, cost: Cost, eeprom: Eeprom) -> DeviceState {
         let values = Values::new(&settings.device);
         let reads = plan::plan(&settings.device, cost, &[]);
         let polls = Polls::new(reads, settings.device.wire.intervals, |point| values.is_selector(point));
@@ -101,7 +101,7 @@ impl DeviceState {
             refused: Vec::new(),
             presence: Presence::Absent { reason: "not yet asked".into() },
             patience: Patience::default(),
-            wear: Wear::default(),
+            wear: Wear::new(eeprom),
             upkeep: Upkeep::default(),
             keeping: Keeping::default(),
             asked_timeout: Duration::ZERO,

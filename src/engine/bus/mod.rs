@@ -182,7 +182,7 @@ impl Bus {
         let cost = Cost::of(&bus.link, Duration::from_millis(5));
         let of_bus = settings.devices.iter().filter(|device| device.bus == index);
         let mut devices: Vec<DeviceState> =
-            of_bus.map(|device| DeviceState::new(device.clone(), cost)).collect();
+            of_bus.map(|device| DeviceState::new(device.clone(), cost, settings.eeprom)).collect();
         let mut counters = Counters::default();
         for device in &mut devices {
             counters.persistent_writes += device.recall(memories);

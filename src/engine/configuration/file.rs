@@ -33,6 +33,8 @@ record! {
         /// devices stay fed; `stop_feeding` leaves devices with a watchdog alone, so that their outputs
         /// fall to the safe state.
         on_broker_loss: Part<OnBrokerLoss> = Part::of(OnBrokerLoss::Keep),
+        /// How often what is kept in EEPROM may be written, for it wears out.
+        eeprom: Option<Part<Eeprom>>,
         /// Folders with profiles beside the shipped ones; a profile there wins.
         profiles: Part<Vec<At<String>>> = Part::of(Vec::new()),
         /// Serial lines and TCP connections, by name.
@@ -76,6 +78,16 @@ record! {
     pub struct Http {
         /// `host:port`; port 0 takes a free one, `null` turns HTTP off.
         listen: Option<Listen> = Some(Listen(HostPort { host: "127.0.0.1".into(), port: 8485 })),
+    }
+}
+
+record! {
+    /// How often what is kept in EEPROM may be written, for it wears out.
+    pub struct Eeprom {
+        /// A point not more than once in this time; a newer value waits. `0s`: at any time.
+        interval: At<Duration> = At::nowhere(Duration::from_secs(60)),
+        /// All points of a device together not more often in 24 hours; then commands are refused.
+        daily: At<u16> = At::nowhere(500),
     }
 }
 

@@ -16,7 +16,7 @@ use crate::engine::device::Device;
 use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
-    Bus, DeviceSettings, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password, Settings, Wanted,
+    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password, Settings, Wanted,
 };
 use crate::engine::time::Duration;
 use crate::engine::yaml::{
@@ -92,6 +92,7 @@ impl Resolver<'_> {
         }
         self.within(file.republish.get(), Duration::from_secs(1), Duration::from_secs(86_400));
         let mqtt = section(&file.mqtt).map(|mqtt| self.mqtt(&mqtt));
+        let eeprom = section(&file.eeprom).map(|eeprom| self.eeprom(&eeprom));
         let buses = self.buses(file);
         let devices = self.devices(file);
         // Each `?` stands for a fault that has been noted.
@@ -102,6 +103,7 @@ impl Resolver<'_> {
             state_dir: PathBuf::from(&file.state_dir.get()?.value),
             republish: file.republish.get()?.value,
             on_broker_loss: *file.on_broker_loss.get()?,
+            eeprom: eeprom?,
             buses,
             devices,
         })
@@ -131,6 +133,14 @@ impl Resolver<'_> {
             },
             base_topic: file.base_topic.0.clone(),
         }
+    }
+
+    fn eeprom(&mut self, file: &file::Eeprom) -> Eeprom {
+        self.within(Some(&file.interval), Duration::ZERO, Duration::from_secs(86_400));
+        if file.daily.value == 0 {
+            self.faults.add(&file.daily.place, "no writes at all; expected at least 1 a day");
+        }
+        Eeprom { interval: file.interval.value, daily: file.daily.value.into() }
     }
 
     fn buses(&mut self, file: &Configuration) -> Vec<Bus> {

@@ -152,6 +152,9 @@ pub fn announcement(
             components.push((entity.key.clone(), component(topics, device, &point.name, &entity)));
         }
     }
+    if device.device.points.iter().any(|point| point.persistent) {
+        components.push((EEPROM_WRITES.into(), eeprom_writes(topics, device)));
+    }
     for thing in &device.device.things {
         if let Some(component) = thing_component(topics, device, thing, known) {
             components.push((thing.name.clone(), component));
@@ -166,6 +169,24 @@ pub fn announcement(
     });
     let availability = [topics.bridge_state(), topics.availability(&device.name)];
     Announcement::new(gateway, &identity, without_empty(about), &availability, components)
+}
+
+/// The key of the entity that counts the writes to the device's EEPROM, and the info's too.
+const EEPROM_WRITES: &str = "eeprom_writes";
+
+fn eeprom_writes(topics: &Topics, device: &DeviceSettings) -> Map<String, Value> {
+    let component = json!({
+        "platform": "sensor",
+        "name": "EEPROM writes",
+        "unique_id": format!("{}_{EEPROM_WRITES}", topics.identity(&device.name)),
+        "default_entity_id": format!("sensor.{}_{EEPROM_WRITES}", device.name),
+        "state_topic": topics.info(&device.name),
+        "value_template": format!("{{{{ value_json.{EEPROM_WRITES} }}}}"),
+        "state_class": "total_increasing",
+        "entity_category": "diagnostic",
+        "icon": "mdi:memory",
+    });
+    if let Value::Object(component) = component { component } else { Map::new() }
 }
 
 fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Entity) -> Map<String, Value> {

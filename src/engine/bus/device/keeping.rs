@@ -42,6 +42,9 @@ impl DeviceState {
         let memory = memories.devices.get(&self.settings.name).cloned().unwrap_or_default();
         self.keeping.plan = memory::fingerprint(device, &reads);
         self.counters.persistent_writes = memory.persistent_writes;
+        if let Some(left) = memory.writes_left {
+            self.wear.recall(left);
+        }
         // Another profile asks otherwise, and is refused otherwise.
         if memory.plan == self.keeping.plan {
             self.refused = memory.refused.clone();
@@ -58,11 +61,12 @@ impl DeviceState {
         self.counters.persistent_writes
     }
 
-    fn memory(&self) -> Memory {
+    fn memory(&self, now: Time) -> Memory {
         Memory {
             plan: if self.refused.is_empty() { String::new() } else { self.keeping.plan.clone() },
             refused: self.refused.clone(),
             persistent_writes: self.counters.persistent_writes,
+            writes_left: (self.counters.persistent_writes > 0).then(|| self.wear.writes_left(now)),
             section: self.upkeep.section().clone(),
             settled: self.upkeep.settled(),
         }
@@ -74,7 +78,7 @@ impl DeviceState {
             return None;
         }
         self.keeping.changed = false;
-        let memory = self.memory();
+        let memory = self.memory(now);
         if memory == self.keeping.stored {
             return None;
         }
@@ -107,7 +111,7 @@ impl DeviceState {
         now: Time,
         is_settling: impl Fn(PointIndex) -> bool,
     ) -> Option<(PointIndex, String)> {
-        self.upkeep.next(|point| !is_settling(point) && self.can_take(now, Target::Setting(point)))
+        self.upkeep.next(|point| !is_settling(point) && self.can_take(now, Target::Setting(point), ""))
     }
 
     /// From when on the next setting may be written, for its EEPROM's sake.

@@ -1,5 +1,6 @@
 //! What a device does with commands: which it can take, what is asked for them, and what follows.
 
+use crate::engine::codec;
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::device::PointIndex;
 use crate::engine::plan::Read;
@@ -46,7 +47,7 @@ impl DeviceState {
         wanted: &str,
     ) -> Result<Vec<(PointIndex, String)>, String> {
         let thing = &self.settings.device.things[thing];
-        if crate::engine::codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
+        if codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
             return Err(format!("`{}` does not exist in the present mode of the device", thing.name));
         }
         match thing.command(wanted) {
@@ -61,11 +62,24 @@ impl DeviceState {
 
     /// Whether a command can begin: the device is there, is the right one, what decides about the points
     /// is known, and their EEPROM has been spared long enough.
-    pub(in crate::engine::bus) fn can_take(&self, now: Time, target: Target) -> bool {
-        now >= self.writable_at(target)
+    pub(in crate::engine::bus) fn can_take(&self, now: Time, target: Target, wanted: &str) -> bool {
+        (now >= self.writable_at(target) || self.seems_to_hold(target, wanted))
             && self.presence == Presence::Present
             && self.patience.failures() == 0
             && self.unknown_selector(target).is_none()
+    }
+
+    /// Whether the point's last reading is what is wanted: to find it so again wears out nothing.
+    fn seems_to_hold(&self, target: Target, wanted: &str) -> bool {
+        let Target::Point(point) = target else { return false };
+        let (details, Ok(resolved)) =
+            (self.details(point), codec::resolve(self.device(), point, self.known()))
+        else {
+            return false;
+        };
+        let Some(write) = &details.write else { return false };
+        let words = codec::encode(details, &write.rule, &resolved, wanted);
+        words.is_ok_and(|words| codec::read(&resolved, &words) == *self.values.reading(point))
     }
 
     fn unknown_selector(&self, target: Target) -> Option<PointIndex> {
@@ -81,7 +95,17 @@ impl DeviceState {
     /// From when on all that is written may be written, for its EEPROM's sake.
     pub(in crate::engine::bus) fn writable_at(&self, target: Target) -> Time {
         let written = self.written_by(target).into_iter().filter(|point| self.details(*point).persistent);
-        written.map(|point| self.wear.allowed_at(point)).max().unwrap_or_default()
+        let allowed = written.map(|point| self.wear.allowed_at(point)).max();
+        match (target, allowed) {
+            // A person is told that the budget is spent; a setting waits for it.
+            (Target::Setting(_), Some(allowed)) => allowed.max(self.wear.budget_at()),
+            (_, allowed) => allowed.unwrap_or_default(),
+        }
+    }
+
+    /// Why the point may not be written now, although its own time has come.
+    pub(in crate::engine::bus) fn is_spent(&self, now: Time, point: PointIndex) -> Option<String> {
+        if self.details(point).persistent { self.wear.spent(now) } else { None }
     }
 
     /// Why a command has not begun.
@@ -177,5 +201,9 @@ impl DeviceState {
             }
         }
         self.after_news(now, context);
+        if self.details(point).persistent && self.is_present() {
+            // How often the EEPROM has been written stands there.
+            self.tell_info(context);
+        }
     }
 }

@@ -159,6 +159,7 @@ impl DeviceState {
             "online": self.presence == Presence::Present,
             "reason": self.reason(),
             "missing": missing,
+            "eeprom_writes": self.counters.persistent_writes,
             "drift": drift,
         })
         .to_string();

@@ -1,35 +1,83 @@
-//! How often EEPROM may be written: freely while a person sets a device up, and then
-//! once a minute, whatever a script does.
+//! How often EEPROM may be written: a point not more than once in an interval, a device not more often
+//! in a day than its budget, whatever a script does.
 
 use std::collections::BTreeMap;
 
 use crate::engine::device::PointIndex;
+use crate::engine::settings::Eeprom;
 use crate::engine::time::{Duration, Time};
 
-/// So many writes of a point may follow one another.
-const BURST: u32 = 20;
-/// After them, one in this time. A register of 100,000 writes lasts 70 days of the worst script.
-const INTERVAL: Duration = Duration::from_secs(60);
+const DAY: u64 = 24 * 3600 * 1_000_000;
+/// What a write takes out of the budget.
+const WRITE: u64 = 2 * DAY;
 
 /// The writes of one device's persistent points.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(super) struct Wear {
-    /// When as many writes as there were would have been due, one in each interval.
-    due: BTreeMap<PointIndex, Time>,
+    rules: Eeprom,
+    written_at: BTreeMap<PointIndex, Time>,
+    /// What is left of the budget. Half of a day's writes fit into it, and half of them come in during a
+    /// day, a little each microsecond: so no 24 hours see more than the whole, and no clock is needed
+    /// that tells when a day begins.
+    left: u64,
+    left_at: Time,
 }
 
 impl Wear {
-    /// The point is being written.
-    pub(super) fn spend(&mut self, now: Time, point: PointIndex) {
-        let due = self.due.entry(point).or_default();
-        *due = (*due).max(now) + INTERVAL;
+    /// A device that may be written as often as its `rules` say.
+    pub(super) fn new(rules: Eeprom) -> Wear {
+        Wear { rules, written_at: BTreeMap::new(), left: Wear::full(rules), left_at: Time::default() }
     }
 
-    /// From when on the point may be written.
+    fn full(rules: Eeprom) -> u64 {
+        u64::from(rules.daily) * DAY
+    }
+
+    /// Goes on with so many writes left of the budget, after a restart.
+    pub(super) fn recall(&mut self, writes_left: u32) {
+        self.left = (u64::from(writes_left) * WRITE).min(Wear::full(self.rules));
+    }
+
+    /// The point is being written.
+    pub(super) fn spend(&mut self, now: Time, point: PointIndex) {
+        self.written_at.insert(point, now);
+        self.left = self.left(now).saturating_sub(WRITE);
+        self.left_at = now;
+    }
+
+    /// From when on the point may be written, as far as its own interval goes.
     pub(super) fn allowed_at(&self, point: PointIndex) -> Time {
-        let ahead = INTERVAL * (BURST - 1);
-        let due = self.due.get(&point).copied().unwrap_or_default();
-        Time(due.0.saturating_sub(ahead.as_micros() as u64))
+        self.written_at.get(&point).map_or(Time::default(), |at| *at + self.rules.interval)
+    }
+
+    /// From when on the device's budget allows another write.
+    pub(super) fn budget_at(&self) -> Time {
+        let missing = WRITE.saturating_sub(self.left);
+        self.left_at + Duration::from_micros(missing.div_ceil(u64::from(self.rules.daily.max(1))))
+    }
+
+    /// Why nothing may be written now: the budget is spent.
+    pub(super) fn spent(&self, now: Time) -> Option<String> {
+        let until = self.budget_at();
+        (now < until).then(|| {
+            format!(
+                "the EEPROM budget of this device is spent ({} writes in 24 hours, `eeprom: {{daily: …}}`); \
+                 the next write may come in {} s",
+                self.rules.daily,
+                (until - now).as_secs() + 1
+            )
+        })
+    }
+
+    /// How many writes are left of the budget.
+    pub(super) fn writes_left(&self, now: Time) -> u32 {
+        (self.left(now) / WRITE) as u32
+    }
+
+    fn left(&self, now: Time) -> u64 {
+        let passed = now.since(self.left_at).as_micros() as u64;
+        let refilled = passed.saturating_mul(u64::from(self.rules.daily));
+        self.left.saturating_add(refilled).min(Wear::full(self.rules))
     }
 }
 
@@ -37,19 +85,42 @@ impl Wear {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_few_writes_are_free_and_a_flood_is_not() {
-        let mut wear = Wear::default();
-        let mut now = Time::from_millis(0);
+    const RULES: Eeprom = Eeprom { interval: Duration::from_secs(60), daily: 200 };
+
+    /// How often a script that never rests can write in so many hours.
+    fn writes_in(hours: u64, points: usize, wear: &mut Wear) -> u32 {
         let mut writes = 0;
-        while now < Time::from_millis(3_600_000) {
-            if now >= wear.allowed_at(7) {
-                wear.spend(now, 7);
-                writes += 1;
+        for second in 0..hours * 3600 {
+            let now = Time::from_millis(second * 1000);
+            for point in 0..points {
+                if now >= wear.allowed_at(point) && wear.spent(now).is_none() {
+                    wear.spend(now, point);
+                    writes += 1;
+                }
             }
-            now += Duration::from_millis(100);
         }
-        assert_eq!(writes, BURST + 59);
-        assert_eq!(wear.allowed_at(8), Time::default());
+        writes
+    }
+
+    #[test]
+    fn a_point_is_written_once_in_its_interval() {
+        assert_eq!(writes_in(1, 1, &mut Wear::new(RULES)), 60);
+        let free = Eeprom { interval: Duration::ZERO, daily: 10_000 };
+        assert_eq!(writes_in(1, 1, &mut Wear::new(free)), 3600);
+    }
+
+    #[test]
+    fn a_device_is_written_as_often_as_its_budget_says_and_then_as_it_fills_again() {
+        // Half of the budget at once, and the other half as it comes in.
+        assert_eq!(writes_in(24, 20, &mut Wear::new(RULES)), 200 - 1);
+        let mut wear = Wear::new(RULES);
+        wear.recall(3);
+        let writes = writes_in(1, 20, &mut wear);
+        assert_eq!(writes, 3 + 100 / 24);
+        let now = Time::from_millis(3_600_000);
+        assert_eq!(wear.writes_left(now), 0);
+        let told = wear.spent(now).expect("nothing is left");
+        assert!(told.contains("200 writes in 24 hours") && told.contains("may come in "), "{told}");
+        assert!(wear.spent(wear.budget_at()).is_none());
     }
 }
