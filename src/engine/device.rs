@@ -130,6 +130,9 @@ pub struct Point {
     /// The same value in another place; read from whichever costs less.
     pub also: Option<Address>,
     pub encoding: Encoding,
+    /// What it may mean as the device is set up, where the device itself does not say: the owner names
+    /// one of these.
+    pub ranges: Vec<(String, Form)>,
     pub poll: Poll,
     /// It lives only while all of these hold; empty: always.
     pub when: Vec<Condition>,
@@ -164,6 +167,7 @@ impl Point {
             at,
             also: None,
             encoding: Encoding::Plain(Form::new(kind)),
+            ranges: Vec::new(),
             poll,
             when: Vec::new(),
             write: None,

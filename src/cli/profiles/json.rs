@@ -97,7 +97,7 @@ fn point(device: &Device, index: PointIndex) -> Json {
         WriteRule::Names(names) => Some(names),
         _ => None,
     });
-    json!({
+    let mut json = json!({
         "name": point.name,
         "table": point.at.span.table().name(),
         "address": point.at.span.first(),
@@ -154,7 +154,11 @@ fn point(device: &Device, index: PointIndex) -> Json {
         "settle_ms": write.map(|write| write.settle.as_millis() as u64),
         "on_change": write.and_then(|write| write.on_change).map(|between| number(Decimal::integer(between))),
         "entity": entity_json(device, index),
-    })
+    });
+    // Beside the macro, which takes no more keys.
+    let ranges = point.ranges.iter().map(|(name, form)| (name.clone(), form_json(device, form)));
+    json["ranges"] = ranges.collect::<Map<_, _>>().into();
+    json
 }
 
 /// The point that decides about this one's meaning.
@@ -203,9 +207,14 @@ fn thing_json(device: &Device, thing: &Thing) -> Json {
 
 fn case_json(device: &Device, case: &Case) -> Json {
     let Some(form) = &case.form else { return Json::Null };
+    let mut json = form_json(device, form);
+    json["key"] = number(Decimal::integer(case.key));
+    json
+}
+
+fn form_json(device: &Device, form: &Form) -> Json {
     let range = raw_limits(form, None);
     json!({
-        "key": number(Decimal::integer(case.key)),
         "type": form.kind.name(),
         "scale": number(scale(form)),
         "offset": number(form.offset),

@@ -195,6 +195,10 @@ impl Scalar for SettingValue {
 record! {
     /// Wishes for one point of a profile.
     pub struct PointWish {
+        /// What the number means as the device is set up: one of the profile's `ranges`.
+        range: Option<At<String>>,
+        /// It is told only while each of these points has one of these values: what `range` was stated for.
+        when: Map<Name, Vec<At<String>>> = Map::default(),
         /// The unit of a number of which the profile does not know it.
         unit: Option<At<String>>,
         /// A reading that differs less than this from the last one told is not told.

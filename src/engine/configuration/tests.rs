@@ -4,6 +4,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::engine::codec;
 use crate::engine::device::Poll;
 use crate::engine::settings::OnBrokerLoss;
 use crate::engine::value::Decimal;
@@ -44,6 +45,41 @@ fn with_wishes(wishes: &str) -> Device {
          devices:\n  pump:\n    profile: acme/ra2\n    bus: plant\n    unit: 0\n    points:\n{wishes}"
     );
     good(&text).0.devices.remove(0).device
+}
+
+#[test]
+fn a_range_that_the_owner_states_holds_while_the_switches_stand_as_they_were() {
+    let text = "
+buses: {plant: {tcp: 'h:502'}}
+devices:
+  currents:
+    profile: metz-connect/mr-ci4
+    bus: plant
+    unit: 18
+    points:
+      input_1: {range: current_from_4, when: {dip_switch_1: [ON], dip_switch_2: [OFF]}}
+      input_2: {range: voltage}
+";
+    let (settings, _) = load("f", text.as_bytes(), &Library::shipped()).expect("a good file");
+    let device = &settings.devices[0].device;
+    let index = |name: &str| device.points.iter().position(|point| point.name == name).expect(name);
+    let reading = |name: &str, switches: [i128; 2], word: u16| {
+        let mut known = vec![None; device.points.len()];
+        known[index("dip_switch_1")] = Some(switches[0]);
+        known[index("dip_switch_2")] = Some(switches[1]);
+        match codec::resolve(device, index(name), &known) {
+            Ok(resolved) => {
+                format!("{} {}", codec::read(&resolved, &[word]), resolved.unit.unwrap_or_default())
+            }
+            Err(missing) => missing.to_string(),
+        }
+    };
+    // Page 59: 0 is 4 mA, 32767 is 20.38 mA.
+    assert_eq!(reading("input_1", [1, 0], 0), "4.0000 mA");
+    assert_eq!(reading("input_1", [1, 0], 32767), "20.3835 mA");
+    assert_eq!(reading("input_1", [1, 1], 32767), "no reading in this mode");
+    assert_eq!(reading("input_2", [0, 0], 32767), "10.2396875 V");
+    assert_eq!(reading("input_3", [0, 0], 32767), "32767 ");
 }
 
 #[test]

@@ -1,9 +1,12 @@
 //! What the owner of a device wishes for single points of its profile.
 
 use crate::engine::configuration::file::PointWish;
-use crate::engine::device::{Device, Encoding, Form, Kind, Names, Point, PointIndex, Poll, Unit};
+use crate::engine::device::{
+    self, Condition, Device, Encoding, Form, Kind, Names, Point, PointIndex, Poll, Thing, Unit,
+};
+use crate::engine::profile::file;
 use crate::engine::units;
-use crate::engine::yaml::{At, Faults, Map, Node, nearest, read};
+use crate::engine::yaml::{At, Faults, Map, Node, list_of_choices, nearest, read};
 
 /// Applies the wishes in `node`, a map from names of points.
 pub fn apply(node: &Node, device: &mut Device, faults: &mut Faults, warnings: &mut Faults) {
@@ -11,11 +14,17 @@ pub fn apply(node: &Node, device: &mut Device, faults: &mut Faults, warnings: &m
     for (name, wish) in wishes.iter() {
         match device.points.iter().position(|point| point.name == name.value) {
             Some(point) => apply_one(point, wish, device, faults, warnings),
-            None => faults.add(&name.place, unknown_point(name, device)),
+            None => match device.things.iter_mut().find(|thing| thing.name == name.value) {
+                Some(thing) => apply_to_thing(thing, wish, faults),
+                None => faults.add(&name.place, unknown_point(name, device)),
+            },
         }
     }
     for name in &wishes.unread {
-        if !device.points.iter().any(|point| point.name == name.value) {
+        let is_there = device.points.iter().map(|point| &point.name);
+        let is_there =
+            is_there.chain(device.things.iter().map(|thing| &thing.name)).any(|known| *known == name.value);
+        if !is_there {
             faults.add(&name.place, unknown_point(name, device));
         }
     }
@@ -45,7 +54,11 @@ fn apply_one(
     if let Some(poll) = &wish.poll {
         check_poll(index, poll, device, faults, warnings);
     }
+    add_conditions(index, wish, device, faults);
     let point = &mut device.points[index];
+    if let Some(range) = &wish.range {
+        choose_range(point, range, faults);
+    }
     if let Some(poll) = &wish.poll {
         point.poll = poll.value;
     }
@@ -74,7 +87,34 @@ fn apply_one(
             faults.add(&icon.place, format!("`{}` is no icon; expected one like `mdi:fan`", icon.value));
         }
     }
-    let presentation = &mut point.presentation;
+    apply_look(&mut point.presentation, look);
+    check_presentation(point, wish, faults);
+}
+
+/// A thing is made of points: only how it looks is a matter of wishes.
+fn apply_to_thing(thing: &mut Thing, wish: &PointWish, faults: &mut Faults) {
+    let look = &wish.presentation;
+    let facts = [
+        wish.unit.as_ref().map(|key| ("unit", &key.place)),
+        wish.range.as_ref().map(|key| ("range", &key.place)),
+        wish.deadband.as_ref().map(|key| ("deadband", &key.place)),
+        wish.poll.as_ref().map(|key| ("poll", &key.place)),
+        look.r#as.as_ref().map(|key| ("as", &key.place)),
+        look.state_class.as_ref().map(|key| ("state_class", &key.place)),
+        wish.when.iter().next().map(|(key, _)| ("when", &key.place)),
+    ];
+    for (key, place) in facts.into_iter().flatten() {
+        faults.add(place, format!("`{}` is made of points and has no `{key}`; remove it", thing.name));
+    }
+    if let Some(class) = &look.device_class {
+        if let Err(message) = units::check(thing.kind.platform(), Some(&class.value), None, None) {
+            faults.add(&class.place, message);
+        }
+    }
+    apply_look(&mut thing.presentation, look);
+}
+
+fn apply_look(presentation: &mut device::Presentation, look: &file::Presentation) {
     replace(&mut presentation.name, look.name.clone());
     replace(&mut presentation.platform, look.r#as.as_ref().map(|platform| platform.value));
     replace(&mut presentation.device_class, look.device_class.as_ref().map(|class| class.value.clone()));
@@ -82,7 +122,6 @@ fn apply_one(
     replace(&mut presentation.category, look.category);
     replace(&mut presentation.icon, look.icon.as_ref().map(|icon| icon.value.clone()));
     replace(&mut presentation.enabled, look.enabled);
-    check_presentation(point, wish, faults);
 }
 
 fn replace<T>(own: &mut Option<T>, wish: Option<T>) {
@@ -115,6 +154,55 @@ fn check_poll(
             format!("`{name}` decides how `{}` is read; a change made on the device is not seen until the next connect", follower.name),
         ),
         Poll::Fast | Poll::Slow => {}
+    }
+}
+
+/// The owner says which of the profile's ranges the device is set to.
+fn choose_range(point: &mut Point, range: &At<String>, faults: &mut Faults) {
+    match point.ranges.iter().find(|(name, _)| *name == range.value) {
+        Some((_, form)) => point.encoding = Encoding::Plain(form.clone()),
+        None if point.ranges.is_empty() => {
+            faults
+                .add(&range.place, format!("the profile knows what `{}` means; remove `range`", point.name));
+        }
+        None => {
+            let known: Vec<&str> = point.ranges.iter().map(|(name, _)| name.as_str()).collect();
+            let choices = list_of_choices(&range.value, &known);
+            faults.add(&range.place, format!("`{}` is no range of `{}`; {choices}", range.value, point.name));
+        }
+    }
+}
+
+/// The owner says while which switches stand how a reading is to be believed.
+fn add_conditions(index: PointIndex, wish: &PointWish, device: &mut Device, faults: &mut Faults) {
+    for (name, wanted) in wish.when.iter() {
+        let Some(selector) = device.points.iter().position(|point| point.name == name.value.0) else {
+            let known: Vec<&str> = device.points.iter().map(|point| point.name.as_str()).collect();
+            let choices = list_of_choices(&name.value.0, &known);
+            faults.add(&name.place, format!("no point is called `{}`; {choices}", name.value.0));
+            continue;
+        };
+        let names: Vec<(i128, String)> = match device.points[selector].plain() {
+            Some(form) if form.kind == Kind::Bool => vec![(0, "OFF".into()), (1, "ON".into())],
+            Some(form) => form.names.list().to_vec(),
+            None => Vec::new(),
+        };
+        if names.is_empty() || !device.points[selector].is_read() {
+            faults.add(
+                &name.place,
+                format!("`{}` has no named values that are polled; it cannot decide", name.value.0),
+            );
+            continue;
+        }
+        let known: Vec<&str> = names.iter().map(|(_, name)| name.as_str()).collect();
+        for value in wanted.iter().filter(|value| !known.contains(&value.value.as_str())) {
+            let choices = list_of_choices(&value.value, &known);
+            faults
+                .add(&value.place, format!("`{}` is no value of `{}`; {choices}", value.value, name.value.0));
+        }
+        let is_wanted = |name: &str| wanted.iter().any(|value| value.value == name);
+        let values = names.iter().filter(|(_, name)| is_wanted(name)).cloned().collect();
+        device.points[index].when.push(Condition { point: selector, values });
     }
 }
 

@@ -128,6 +128,9 @@ record! {
         like: Option<At<PointPath>>,
         /// It holds the number of a register of this span, and is shown as the name of the point there.
         refers: Option<At<Span>>,
+        /// What it may mean as the device is set up, where the device itself does not say: the configuration
+        /// names one of these.
+        ranges: Map<Name, Form> = Map::default(),
         /// It lives only while each of these points has one of these values.
         when: Map<PointPath, Vec<At<String>>> = Map::default(),
         /// An array of so many values of the type.

@@ -58,6 +58,8 @@ impl Resolution<'_, '_> {
             _ => Encoding::Plain(self.form(expanded, &file.form)),
         };
         let re_read = file.re_read.iter().flat_map(|path| self.lookup_all(path, expanded)).collect();
+        let ranges = file.ranges.iter().map(|(name, form)| (name.value.0.clone(), self.form(expanded, form)));
+        let ranges = ranges.collect();
         let when = self.conditions(&file.when, expanded.into());
         let heartbeat = file.heartbeat.as_ref().and_then(|path| self.lookup(path, expanded));
         let write = if expanded.is_flag { None } else { self.write_of(expanded) };
@@ -66,6 +68,7 @@ impl Resolution<'_, '_> {
             at: expanded.at,
             also: expanded.also,
             encoding,
+            ranges,
             poll: file.poll.as_ref().map_or(Poll::Never, |poll| poll.value),
             when,
             write,

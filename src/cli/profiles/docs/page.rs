@@ -200,7 +200,16 @@ devices:
         let named = (0..device.points.len()).find(is_main);
         if let Some(named) = named {
             let _ = writeln!(text, "    # points:            # wishes for single points");
-            let _ = writeln!(text, "    #   {}: {{name: A name of your own}}", device.points[named].name);
+            let point = &device.points[named];
+            // What the device does not tell is the wish without which the number says little.
+            let ranges: Vec<&str> = point.ranges.iter().map(|(name, _)| name.as_str()).collect();
+            let (range, remark) = match ranges.last() {
+                Some(last) => {
+                    (format!(", range: {last}"), format!("  # or another one of {}", ranges.join(", ")))
+                }
+                None => Default::default(),
+            };
+            let _ = writeln!(text, "    #   {}: {{name: A name of your own{range}}}{remark}", point.name);
         }
         if let Some((setting, value)) = self.a_setting() {
             let _ = writeln!(text, "    # settings:          # what the device keeps shall hold this");

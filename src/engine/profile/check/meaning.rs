@@ -314,6 +314,7 @@ fn forms_of(file: &crate::engine::profile::file::Point) -> Vec<&Form> {
     if let Some(At { value: Cases::Listed(cases), .. }) = &file.is {
         forms.extend(cases.iter().filter_map(|(_, form)| form.as_ref()));
     }
+    forms.extend(file.ranges.iter().map(|(_, form)| form));
     forms
 }
 
