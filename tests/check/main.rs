@@ -157,3 +157,39 @@ fn json(output: &Output) -> Json {
 fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).expect("output is UTF-8")
 }
+
+#[test]
+fn watchdogs_and_heartbeats_that_will_not_be_fed_in_time_are_named_with_what_to_change() {
+    let with = |watchdog: &str, heartbeat: &str| {
+        format!(
+            "buses: {{basement: {{serial: /dev/serial/by-id/usb-A, baud: 19200}}}}\n\
+             devices:\n\
+             \x20 relays: {{profile: metz-connect/mr-do4, bus: basement, unit: 18, settings: {{watchdog: {watchdog}}}}}\n\
+             \x20 dampers: {{profile: metz-connect/mr-dio42, bus: basement, unit: 19, settings: {{channel_1_receive_time: {heartbeat}}}}}\n"
+        )
+    };
+    let met = |file: &str, device: usize| {
+        let feeding = json(&check(file, &["--json"]))["buses"][0]["devices"][device]["feeding"].clone();
+        let kind = if device == 0 { "watchdog" } else { "heartbeat" };
+        let feeding = feeding.as_array().expect("a list").iter().find(|feeding| feeding["kind"] == kind);
+        let feeding = feeding.expect("one of this kind");
+        (feeding["met"].as_bool(), feeding["met_one_silent"].as_bool())
+    };
+    for (watchdog, heartbeat, relays, dampers) in [
+        ("3s", "30s", (Some(true), Some(true)), (Some(true), Some(true))),
+        ("900ms", "1s", (Some(true), Some(false)), (Some(true), Some(false))),
+        ("300ms", "100ms", (Some(false), Some(false)), (Some(false), Some(false))),
+        ("0s", "0s", (Some(true), Some(true)), (Some(true), Some(true))),
+    ] {
+        let file = with(watchdog, heartbeat);
+        assert_eq!((met(&file, 0), met(&file, 1)), (relays, dampers), "{watchdog} {heartbeat}");
+    }
+    let told = text(&check(&with("900ms", "100ms"), &[]).stdout);
+    for part in [
+        "relays: watchdog `watchdog` of 900 ms may run out while another device is silent",
+        "dampers: heartbeat `channel_1_receive_time` of 100 ms will run out",
+        "dampers: watchdog `watchdog` is as the device has it",
+    ] {
+        assert!(told.contains(part), "`{part}` is missing in:\n{told}");
+    }
+}

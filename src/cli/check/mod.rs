@@ -1,5 +1,7 @@
 //! `busker check`: is the configuration right, and can each bus keep up with it?
 
+mod feeding;
+
 use std::collections::BTreeMap;
 
 use serde::Serialize;
@@ -13,6 +15,7 @@ use crate::engine::plan::{Cost, plan};
 use crate::engine::settings::{Bus, DeviceSettings, Link};
 use crate::engine::time::Duration;
 use crate::engine::yaml::Diagnostic;
+use feeding::Feeding;
 
 /// Check the configuration and the profiles that it uses
 ///
@@ -90,6 +93,8 @@ struct DeviceSummary {
     points: usize,
     /// By poll class.
     polls: BTreeMap<&'static str, PollSummary>,
+    /// Its watchdog and heartbeats.
+    feeding: Vec<Feeding>,
 }
 
 #[derive(Serialize)]
@@ -160,6 +165,11 @@ impl Summary {
                 table.row(cells);
             }
             text.push_str(&table.render());
+            for device in &bus.devices {
+                for feeding in &device.feeding {
+                    text.push_str(&format!("  {}\n", feeding.text(&device.name)));
+                }
+            }
         }
         text
     }
@@ -179,11 +189,11 @@ impl PollSummary {
 }
 
 impl BusSummary {
-    fn of<'s>(bus: &Bus, devices: impl Iterator<Item = &'s DeviceSettings>) -> BusSummary {
+    fn of<'s>(bus: &Bus, devices: impl Iterator<Item = &'s DeviceSettings> + Clone) -> BusSummary {
         let mut longest_read = Duration::ZERO;
         let mut longest_timeout = bus.response_timeout;
         let mut summaries = Vec::new();
-        for settings in devices {
+        for settings in devices.clone() {
             let wire = &settings.device.wire;
             longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
             let cost = Cost::of(&bus.link, USUAL_TURNAROUND);
@@ -212,6 +222,7 @@ impl BusSummary {
                 unit: settings.unit,
                 points: settings.device.points.len(),
                 polls,
+                feeding: Vec::new(),
             });
         }
         let polls = || summaries.iter().flat_map(|device| device.polls.values());
@@ -219,6 +230,11 @@ impl BusSummary {
         // A bus that cannot keep up stretches every period by the same factor.
         for poll in summaries.iter_mut().flat_map(|device| device.polls.values_mut()) {
             poll.real_period = poll.period.map(|period| period * load.max(1.0));
+        }
+        for (summary, settings) in summaries.iter_mut().zip(devices) {
+            let periods = summary.polls.values().filter_map(|poll| poll.real_period);
+            let delays = feeding::delays(periods.reduce(f64::min), longest_read, longest_timeout);
+            summary.feeding = feeding::of_device(settings, delays);
         }
         BusSummary {
             name: bus.name.clone(),
