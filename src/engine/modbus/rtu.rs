@@ -8,10 +8,11 @@
 //!   reply is dropped. It ends early when that reply comes. After a probe of a silent device it lasts
 //!   as long as that device's replies have come late before: for most not at all.
 //! * A reply later than the quarantine may meet the next request. If it differs in unit, function
-//!   or count it is told apart. If it does not, the first reply to such a request is believed only
-//!   if no second one comes before its deadline; if one does, the second is the answer. The limit:
-//!   a device that answers neither in its time nor in the quarantine, but while a later request of
-//!   the same shape waits, and leaves that one unanswered, cannot be told from a good one.
+//!   or count it is told apart. If it does not, a reply to such a request is believed at once only
+//!   behind as many others as there are late ones to come, and at the deadline only if nothing else
+//!   came from that unit. The limit: a device that answers neither in its time nor in the quarantine,
+//!   but while a later request of the same shape waits, and leaves that one unanswered, cannot be told
+//!   from a good one.
 //! * Some adapters return our own bytes. Such an echo is skipped and remembered: the replies to
 //!   functions 5, 6 and 8 look like it.
 
@@ -234,7 +235,7 @@ impl Guard {
         if now < self.deadline(&waiting) {
             return None;
         }
-        Some(match self.reply_from(&waiting, 0, true) {
+        Some(match self.only_reply(&waiting) {
             Some(found) => self.answered(waiting, found),
             None => self.unanswered(now, waiting),
         })
@@ -256,20 +257,28 @@ impl Guard {
         Some(Reply::new(Err(RequestError::Link(reason.to_owned())), sent_at, None, &mut self.discarded))
     }
 
-    /// The reply that can be delivered without waiting longer.
+    /// The reply that can be delivered without waiting longer: units answer in order, so it comes
+    /// behind as many others as earlier requests could still get.
     fn trusted_reply(&self, waiting: &Waiting, silent: bool) -> Option<Found> {
-        let first = self.reply_from(waiting, 0, silent)?;
-        if !self.could_be_late(&first) {
-            return Some(first);
+        let mut late = Vec::new();
+        let mut start = 0;
+        loop {
+            let found = self.reply_from(waiting, start, silent)?;
+            match late_reply(&self.heard[found.start..found.end], &self.unanswered, &late) {
+                // A repeated write confirms the same either way.
+                Some((index, _)) if found.result != Ok(Answer::Written) => late.push(index),
+                _ => return Some(found),
+            }
+            start = found.end;
         }
-        self.reply_from(waiting, first.end, silent)
     }
 
-    /// Whether the reply fits an earlier request as well. A repeated write confirms the same
-    /// either way.
-    fn could_be_late(&self, found: &Found) -> bool {
-        let bytes = &self.heard[found.start..found.end];
-        found.result != Ok(Answer::Written) && late_reply(bytes, &self.unanswered, &[]).is_some()
+    /// The reply to believe when nothing more comes in time: one that could be late, but is the only
+    /// one heard of its unit. Where there are more, they are late, and so may this one be.
+    fn only_reply(&self, waiting: &Waiting) -> Option<Found> {
+        let late = sort(&self.heard, &self.frame, None, &self.unanswered).late;
+        let of_unit = late.iter().filter(|late| self.unanswered[**late].request.unit == waiting.request.unit);
+        if of_unit.count() > 1 { None } else { self.reply_from(waiting, 0, true) }
     }
 
     /// The first whole reply from `start` on. One that has begun earlier and may still become whole
@@ -396,9 +405,21 @@ impl Guard {
             self.echo = Echo::No;
         }
         self.count(sorted.discarded);
-        self.forget(&sorted.late);
-        // Units answer in order: no older request of this one gets a reply any more.
-        self.unanswered.retain(|late| late.request.unit != waiting.request.unit);
+        // Units answer in order: no request gets a reply any more that is older than the one answered.
+        // That may be an earlier write of the same; then this one still has its reply to come.
+        let bytes = &self.heard[found.start..found.end];
+        let earlier = late_reply(bytes, &self.unanswered, &sorted.late).map(|(index, _)| index);
+        let earlier = earlier.filter(|_| found.result == Ok(Answer::Written));
+        let until = earlier.unwrap_or(self.unanswered.len());
+        let unit = waiting.request.unit;
+        let over = self.unanswered.iter().enumerate().filter(|(index, late)| {
+            sorted.late.contains(index) || (late.request.unit == unit && *index <= until)
+        });
+        let over: Vec<usize> = over.map(|(index, _)| index).collect();
+        self.forget(&over);
+        if earlier.is_some() {
+            self.remember(&waiting, self.heard_at[found.end - 1]);
+        }
         let times = (self.heard_at[found.start], self.heard_at[found.end - 1]);
         self.clear(found.end);
         self.state = State::Idle;

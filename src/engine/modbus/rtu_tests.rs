@@ -287,6 +287,45 @@ fn a_reply_that_might_be_the_late_one_is_believed_only_if_no_second_follows() {
 }
 
 #[test]
+fn behind_several_late_replies_the_answer_is_the_one_in_its_place() {
+    let stale = framed("01 04 04 00 63 00 63");
+    let unanswered_twice = || {
+        let mut scene = Scene::without_echo();
+        for _ in 0..2 {
+            scene.ask(&two_inputs());
+            scene.expect("no answer", Err(RequestError::Timeout));
+        }
+        scene.ask(&two_inputs()).wait(5).hears(stale.clone()).wait(5).hears(stale.clone()).wait(5);
+        scene
+    };
+    let mut scene = unanswered_twice();
+    assert_eq!(scene.reply, None);
+    scene.hears(framed("01 04 04 00 01 00 02"));
+    assert_eq!(scene.expect("the third", words(&[1, 2])), counts([0, 2, 0, 0, 0]));
+    scene.expect_the_next_reading_right("after the third");
+
+    // The deadline comes first: both are late ones.
+    scene = unanswered_twice();
+    assert_eq!(scene.expect("none of the two", Err(RequestError::Timeout)), counts([0, 2, 0, 0, 0]));
+}
+
+#[test]
+fn a_repeated_write_may_be_confirmed_by_the_earlier_one_and_what_lies_between_is_still_to_come() {
+    let mut scene = Scene::without_echo();
+    let relay = frame(1, &pdu::encode(&set_relay().call).expect("a request that can be asked"));
+    for request in [set_relay(), two_inputs()] {
+        scene.ask(&request);
+        scene.expect("no answer", Err(RequestError::Timeout));
+    }
+    scene.ask(&set_relay()).wait(5).hears(relay.clone());
+    scene.expect("the earlier one's", Ok(Answer::Written));
+    scene.ask(&two_inputs()).wait(5).hears(framed("01 04 04 00 63 00 63")).wait(1).hears(relay).wait(1);
+    assert_eq!(scene.reply, None);
+    scene.hears(framed("01 04 04 00 01 00 02"));
+    assert_eq!(scene.expect("the read's own", words(&[1, 2])), counts([0, 2, 0, 0, 0]));
+}
+
+#[test]
 fn an_echo_is_skipped_and_no_write_is_confirmed_by_it() {
     let echo = |request: &Request| {
         frame(request.unit, &pdu::encode(&request.call).expect("a request that can be asked"))

@@ -1,0 +1,334 @@
+//! An hour of bus life with faults of every kind, in seconds: whatever is published was true between
+//! the request and its answer, each command has one outcome, and nothing moves without a command.
+
+mod device;
+mod world;
+
+use std::collections::BTreeMap;
+
+use busker::engine::bus::{Command, Event};
+use busker::engine::configuration;
+use busker::engine::profile::Library;
+use busker::engine::settings::Settings;
+use busker::engine::time::{Duration, Time};
+use busker::simulator::device::Place;
+use busker::simulator::line::Line;
+use busker::simulator::script::Action;
+use busker::simulator::{Fault, LineSettings};
+use fastrand::Rng;
+
+use device::{BLOCK, BLOCKS, Diary, STORED, Store, Timepiece, held};
+use world::{Published, World};
+
+/// The units; the addresses between them belong to nobody, so that a device with a wrong address is
+/// not taken for another one, as it would on any line.
+const UNITS: [u8; 8] = [1, 3, 5, 7, 9, 11, 13, 15];
+/// How much bus life each seed gets.
+const LIFE: Duration = Duration::from_secs(15 * 60);
+/// After the faults everything must be right again within this.
+const CALM: Duration = Duration::from_secs(60);
+/// A command waits for ten seconds, and is on the wire for a few more.
+const COMMAND_LIFE: Duration = Duration::from_secs(20);
+
+#[test]
+fn an_hour_of_faults_brings_nothing_false() {
+    for seed in 1..=4 {
+        Soak::new(seed, FAULTS, None).run();
+    }
+}
+
+#[test]
+fn nor_does_it_behind_an_adapter_that_returns_every_request() {
+    Soak::new(5, FAULTS, Some("echo")).run();
+}
+
+/// What happens to a device, for up to half a minute.
+const FAULTS: &[&str] = &[
+    "silent",
+    "silent,every=2",
+    "slow=150ms",
+    "late=700ms,every=3",
+    "late=1s,every=4",
+    "late=6s,every=5",
+    "dribble=5ms",
+    "garbled",
+    "garbled,every=2",
+    "noisy",
+    "leading-zero",
+    "short",
+    "short,every=3",
+    "other-unit",
+    "exception=4",
+    "exception=6,every=2",
+    "reboot=10s",
+];
+
+/// One life of a bus.
+struct Soak {
+    random: Rng,
+    faults: &'static [&'static str],
+    /// A fault that all devices have all the time.
+    always: Option<Fault>,
+    world: World,
+    diary: Diary,
+    commands: Vec<Sent>,
+}
+
+/// A command that was sent.
+struct Sent {
+    at: Time,
+    unit: u8,
+    store: Store,
+    value: u16,
+}
+
+impl Soak {
+    fn new(seed: u64, faults: &'static [&'static str], always: Option<&str>) -> Soak {
+        let diary = Diary::default();
+        let turnaround = Duration::from_millis(5);
+        let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
+        for unit in UNITS {
+            let at = Place { unit, device: device_name(unit) };
+            line.add(at, Box::new(Timepiece::new(unit, diary.clone()))).expect("a unit of its own");
+        }
+        let always = always.map(|fault| fault.parse::<Fault>().expect("a fault"));
+        if let Some(fault) = &always {
+            line.add_fault(Time(0), fault).expect("all units");
+        }
+        let world = World::new(gateway(), line);
+        Soak { random: Rng::with_seed(seed), faults, always, world, diary, commands: Vec::new() }
+    }
+
+    fn run(mut self) {
+        let end = Time(0) + LIFE;
+        while self.world.now < end {
+            let pause = Duration::from_millis(self.random.u64(5..1500));
+            self.world.run_until(self.world.now + pause);
+            self.something_happens();
+        }
+        for unit in UNITS {
+            self.world.act(unit, &Action::Power { unit, on: true });
+            self.repair(unit);
+        }
+        self.world.tell(Event::BrokerUp);
+        self.world.run_until(end + CALM);
+        self.check_messages();
+        self.check_commands();
+        self.check_end();
+    }
+
+    fn something_happens(&mut self) {
+        let unit = UNITS[self.random.usize(..UNITS.len())];
+        match self.random.u8(0..100) {
+            0..10 => {
+                self.repair(unit);
+                let kind = self.faults[self.random.usize(..self.faults.len())];
+                self.world.act(unit, &Action::Fault(format!("unit={unit},{kind}").parse().expect("a fault")));
+            }
+            10..25 => self.repair(unit),
+            25..27 => self.world.act(unit, &Action::Power { unit, on: false }),
+            27..31 => self.world.act(unit, &Action::Power { unit, on: true }),
+            31..33 => self.world.act(unit, &Action::Restart { unit }),
+            33 => self.world.unplug(Duration::from_millis(self.random.u64(1..5000))),
+            34..40 => {
+                let noise = (0..self.random.usize(1..40)).map(|_| self.random.u8(..)).collect();
+                self.world.disturb(noise);
+            }
+            40..42 => self.world.tell(Event::BrokerDown),
+            42..46 => self.world.tell(Event::BrokerUp),
+            _ => {
+                // A burst, as a slider gives it, or one.
+                for _ in 0..if self.random.u8(..4) == 0 { 10 } else { 1 } {
+                    self.command(unit);
+                }
+            }
+        }
+    }
+
+    fn command(&mut self, unit: u8) {
+        let number = self.random.u16(..STORED);
+        let (store, value) = match self.random.bool() {
+            true => (Store::Coil(number), self.random.u16(..2)),
+            false => (Store::Holding(number), self.random.u16(..)),
+        };
+        self.commands.push(Sent { at: self.world.now, unit, store, value });
+        self.world.tell(Event::Command(Command {
+            device: device_name(unit),
+            point: point_name(store),
+            payload: payload(store, value),
+            retained: false,
+        }));
+    }
+
+    fn repair(&mut self, unit: u8) {
+        self.world.act(unit, &Action::Repair { unit });
+        if let Some(fault) = self.always.clone() {
+            self.world.act(unit, &Action::Fault(Fault { unit: Some(unit), ..fault }));
+        }
+    }
+
+    /// Whatever was published was so between the request and its answer.
+    fn check_messages(&self) {
+        let (mut checked, mut unknown) = (0, 0);
+        let mut told: BTreeMap<&str, &str> = BTreeMap::new();
+        for published in &self.world.published {
+            let Some((unit, point)) = state_of(&published.message.topic) else { continue };
+            if published.message.payload == "None" {
+                told.remove(published.message.topic.as_str());
+                unknown += 1;
+                continue;
+            }
+            // After a command that was refused, a switch that was moved on a screen is told to move back.
+            let again = told.insert(&published.message.topic, &published.message.payload);
+            let (from, to) = (published.asked_at[usize::from(unit)], published.at);
+            let text = &published.message.payload;
+            let is_true = match point {
+                Point::Reading(address) => held(unit, address, from, to, text.parse().expect("a number")),
+                Point::Stored(_) if again == Some(text) => true,
+                Point::Stored(store) => self.diary.held(unit, store, from, to, value(text)),
+            };
+            assert!(
+                is_true,
+                "{} {text}, asked at {from}, published at {to}:{}",
+                published.message.topic,
+                self.world.heard_before(to, unit)
+            );
+            checked += 1;
+        }
+        assert!(checked > 10_000 && unknown > 500, "{checked} checked, {unknown} without a value");
+    }
+
+    /// Each command has one outcome, which is true; and nothing was written without one.
+    fn check_commands(&self) {
+        let mut kinds: BTreeMap<String, usize> = BTreeMap::new();
+        let mut outcomes: BTreeMap<(u8, Store), usize> = BTreeMap::new();
+        for published in &self.world.published {
+            let Some(topic) = published.message.topic.strip_suffix("/outcome") else { continue };
+            let Some((unit, Point::Stored(store))) = state_of(topic) else { panic!("{topic}") };
+            *outcomes.entry((unit, store)).or_default() += 1;
+            let outcome: serde_json::Value = serde_json::from_str(&published.message.payload).expect("JSON");
+            let kind = outcome["outcome"].as_str().expect("a kind");
+            *kinds.entry(kind.to_owned()).or_default() += 1;
+            if kind == "done" {
+                let wanted = value(outcome["wanted"].as_str().expect("a value"));
+                let sent = self.commands.iter().rev().find(|sent| {
+                    (sent.unit, sent.store, sent.value) == (unit, store, wanted) && sent.at <= published.at
+                });
+                let from = sent.expect("a command for each outcome").at;
+                assert!(self.diary.held(unit, store, from, published.at, wanted), "{topic} {outcome}");
+            }
+        }
+        for sent in &self.commands {
+            *outcomes.entry((sent.unit, sent.store)).or_default() -= 1;
+        }
+        assert!(outcomes.values().all(|left| *left == 0), "outcomes too many: {outcomes:?}");
+        for kind in ["done", "no_reply", "expired", "refused"] {
+            assert!(kinds.contains_key(kind), "no command was ever `{kind}`: {kinds:?}");
+        }
+        let mut reasons: Vec<&Sent> = self.commands.iter().collect();
+        for write in self.diary.changes().iter().filter(|change| change.written) {
+            let reason = reasons.iter().position(|sent| {
+                (sent.unit, sent.store, sent.value) == (write.unit, write.store, write.value)
+                    && sent.at <= write.at
+                    && write.at.since(sent.at) < COMMAND_LIFE
+            });
+            reasons.remove(reason.unwrap_or_else(|| panic!("nobody asked for this: {write:?}")));
+        }
+    }
+
+    /// A minute after the last fault everything is known, new and right.
+    fn check_end(&self) {
+        let mut last: BTreeMap<&str, &Published> = BTreeMap::new();
+        for published in &self.world.published {
+            last.insert(&published.message.topic, published);
+        }
+        for unit in UNITS {
+            let topic = |point: &str| format!("busker/{}/{point}", device_name(unit));
+            let says = |point: &str| last[topic(point).as_str()].message.payload.as_str();
+            assert_eq!(says("availability"), "online", "unit {unit}");
+            for address in BLOCKS.iter().flat_map(|block| *block..block + BLOCK) {
+                let reading = last[topic(&format!("reading_{address}")).as_str()];
+                assert!(self.world.now.since(reading.at) < Duration::from_secs(2), "unit {unit}: {address}");
+            }
+            for store in stores() {
+                let holds = payload(store, self.diary.value(unit, store));
+                assert_eq!(says(&point_name(store)), holds, "unit {unit}: {store:?}");
+            }
+        }
+    }
+}
+
+/// A point of the configuration.
+enum Point {
+    Reading(u16),
+    Stored(Store),
+}
+
+/// The unit and point of a state topic.
+fn state_of(topic: &str) -> Option<(u8, Point)> {
+    let (device, point) = topic.strip_prefix("busker/")?.split_once('/')?;
+    let unit = device.strip_prefix("device_")?.parse().ok()?;
+    let reading = point.strip_prefix("reading_").and_then(|address| address.parse().ok());
+    let stored = || stores().find(|store| point_name(*store) == point);
+    let point = reading.map(Point::Reading).or_else(|| stored().map(Point::Stored))?;
+    Some((unit, point))
+}
+
+fn stores() -> impl Iterator<Item = Store> {
+    (0..STORED).flat_map(|number| [Store::Coil(number), Store::Holding(number)])
+}
+
+fn device_name(unit: u8) -> String {
+    format!("device_{unit}")
+}
+
+fn point_name(store: Store) -> String {
+    match store {
+        Store::Coil(number) => format!("relay_{number}"),
+        Store::Holding(number) => format!("level_{number}"),
+    }
+}
+
+fn payload(store: Store, value: u16) -> String {
+    match (store, value) {
+        (Store::Coil(_), 0) => "OFF".into(),
+        (Store::Coil(_), _) => "ON".into(),
+        (Store::Holding(_), value) => value.to_string(),
+    }
+}
+
+fn value(payload: &str) -> u16 {
+    match payload {
+        "ON" => 1,
+        "OFF" => 0,
+        number => number.parse().expect("a number"),
+    }
+}
+
+/// The gateway's settings: all points of all devices, as fast as the line allows.
+fn gateway() -> Settings {
+    let mut points = String::new();
+    for address in BLOCKS.iter().flat_map(|block| *block..block + BLOCK) {
+        points += &format!("      reading_{address}: {{at: input {address}, poll: fast}}\n");
+    }
+    for store in stores() {
+        let place = match store {
+            Store::Coil(number) => format!("at: coil {number}, write: any"),
+            Store::Holding(number) => format!("at: holding {number}, write: 0..65535"),
+        };
+        points += &format!("      {}: {{{place}, poll: fast}}\n", point_name(store));
+    }
+    let mut text = String::from(
+        "buses: {line: {serial: /dev/ttyUSB0, baud: 19200, parity: even, response_timeout: 400ms}}\ndevices:\n",
+    );
+    for unit in UNITS {
+        text += &format!(
+            "  {}:\n    bus: line\n    unit: {unit}\n    poll: {{fast: 500ms}}\n    points:\n{points}",
+            device_name(unit)
+        );
+    }
+    match configuration::load("soak.yaml", text.as_bytes(), &Library::shipped()) {
+        Ok((settings, _)) => settings,
+        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
+    }
+}

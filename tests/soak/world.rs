@@ -1,0 +1,217 @@
+//! A bus, its guard and a line of simulated devices, joined without threads, ports and clocks: an hour
+//! passes as fast as it can be calculated.
+
+use busker::engine::bus::{Action, Bus, Event};
+use busker::engine::memory::Memories;
+use busker::engine::modbus::Reply;
+use busker::engine::modbus::guard::Guard;
+use busker::engine::settings::Settings;
+use busker::engine::time::{Duration, Time};
+use busker::engine::topics::Message;
+use busker::simulator::Framing;
+use busker::simulator::line::{Line, Transmission};
+use busker::simulator::script;
+use busker::simulator::wire::Receiver;
+
+pub struct World {
+    pub now: Time,
+    pub line: Line,
+    settings: Settings,
+    bus: Bus,
+    guard: Guard,
+    port: Port,
+    /// The request that is to be sent, and not before when.
+    to_send: Option<Time>,
+    receiver: Receiver,
+    /// What is on its way to the gateway, and which unit sends it.
+    coming: Vec<(Option<u8>, Transmission)>,
+    /// The unit that was asked last.
+    asked: u8,
+    /// When each unit was last asked something.
+    asked_at: [Time; 256],
+    /// When each unit's last reply has come, or will.
+    answered_at: [Time; 256],
+    pub published: Vec<Published>,
+    /// What was on the line, to look at when something is wrong.
+    frames: Vec<(Time, u8, String)>,
+}
+
+/// A message, and since when what it says may be true: since the request was sent that it answers.
+pub struct Published {
+    pub message: Message,
+    pub at: Time,
+    pub asked_at: [Time; 256],
+}
+
+enum Port {
+    Open,
+    OpensAt(Time),
+}
+
+impl World {
+    pub fn new(settings: Settings, line: Line) -> World {
+        let now = Time(0);
+        World {
+            now,
+            receiver: Receiver::new(Framing::Rtu, line.settings()),
+            line,
+            bus: Bus::new(now, &settings, 0, &Memories::default()),
+            guard: Guard::new(&settings.buses[0].link, None),
+            settings,
+            port: Port::OpensAt(now),
+            to_send: None,
+            coming: Vec::new(),
+            asked: 0,
+            asked_at: [now; 256],
+            answered_at: [now; 256],
+            published: Vec::new(),
+            frames: Vec::new(),
+        }
+    }
+
+    /// Hands the bus an event from outside.
+    pub fn tell(&mut self, event: Event) {
+        self.bus.handle(self.now, event);
+        self.perform();
+    }
+
+    /// The adapter is pulled out; the gateway may try to open it again, and can after `away`.
+    pub fn unplug(&mut self, away: Duration) {
+        if matches!(self.port, Port::Open) {
+            self.close(self.now + away);
+            self.tell(Event::LinkDown("unplugged".into()));
+            self.port = Port::OpensAt(self.now + away);
+        }
+    }
+
+    /// What happens to a device takes the replies with it that it still owes.
+    pub fn act(&mut self, unit: u8, action: &script::Action) {
+        self.line.act(self.now, action).expect("a unit of the line");
+        self.coming.retain(|(sender, _)| *sender != Some(unit));
+    }
+
+    /// Bytes that nobody sent come to the gateway.
+    pub fn disturb(&mut self, bytes: Vec<u8>) {
+        self.coming.push((None, Transmission { at: self.now, bytes }));
+    }
+
+    /// What was said to `unit` and by it in the twelve seconds before `at`.
+    pub fn heard_before(&self, at: Time, unit: u8) -> String {
+        let from = Time(at.0.saturating_sub(12_000_000));
+        let frames = self.frames.iter().filter(|(time, who, _)| *who == unit && (from..=at).contains(time));
+        frames.map(|(_, _, frame)| format!("\n{frame}")).collect()
+    }
+
+    /// Lets time pass until `end`.
+    pub fn run_until(&mut self, end: Time) {
+        let mut steps_in_place = 0;
+        loop {
+            let next = self.next_time().max(self.now);
+            if next > end {
+                self.now = end;
+                return;
+            }
+            steps_in_place = if next == self.now { steps_in_place + 1 } else { 0 };
+            assert!(steps_in_place < 1000, "no time passes any more at {}", self.now);
+            self.now = next;
+            self.step();
+        }
+    }
+
+    fn next_time(&self) -> Time {
+        let port = match self.port {
+            Port::OpensAt(at) => Some(at),
+            Port::Open => None,
+        };
+        let send = self.to_send.map(|not_before| not_before.max(self.guard.earliest_send(self.now)));
+        let coming = self.coming.iter().map(|(_, transmission)| transmission.at).min();
+        // The silence is no whole number of microseconds.
+        let silent = self.receiver.deadline().map(|at| at + Duration::from_micros(1));
+        let times = [port, send.or(self.guard.wake_at()), coming, silent, self.bus.wake_at()];
+        times.into_iter().flatten().min().expect("something is always to come")
+    }
+
+    /// Does what is due, in the order of the program's own loop.
+    fn step(&mut self) {
+        let now = self.now;
+        if let Some(received) = self.receiver.next(now) {
+            for mut answer in self.line.hear(now, Framing::Rtu, &received) {
+                // A device that is late does one thing after the other: nothing overtakes.
+                let unit = usize::from(self.asked);
+                answer.at = answer.at.max(self.answered_at[unit] + Duration::from_millis(1));
+                self.answered_at[unit] = answer.at;
+                self.coming.push((Some(self.asked), answer));
+            }
+        }
+        if matches!(self.port, Port::OpensAt(at) if at <= now) {
+            self.port = Port::Open;
+            self.tell(Event::LinkUp);
+        }
+        self.coming.sort_by_key(|(_, transmission)| transmission.at);
+        while self.coming.first().is_some_and(|(_, transmission)| transmission.at <= now) {
+            let (sender, transmission) = self.coming.remove(0);
+            let frame = format!("{now} <- {:02X?}", transmission.bytes);
+            self.frames.push((now, sender.unwrap_or(0), frame));
+            if matches!(self.port, Port::Open) {
+                let reply = self.guard.received(now, &transmission.bytes);
+                self.answered(reply);
+            }
+        }
+        match self.to_send {
+            Some(not_before) if now >= not_before.max(self.guard.earliest_send(now)) => {
+                self.to_send = None;
+                self.receiver.push(now, self.guard.frame());
+                self.asked = self.guard.frame()[0];
+                self.asked_at[usize::from(self.asked)] = now;
+                let frame = format!("{now} -> {:02X?}", self.guard.frame());
+                self.frames.push((now, self.asked, frame));
+                self.guard.sent(now);
+            }
+            Some(_) => {}
+            None if self.guard.wake_at().is_some_and(|at| at <= now) => {
+                let reply = self.guard.wake(now);
+                self.answered(reply);
+            }
+            None => {}
+        }
+        if self.bus.wake_at().is_some_and(|at| at <= now) {
+            self.tell(Event::Wake);
+        }
+    }
+
+    fn answered(&mut self, reply: Option<Reply>) {
+        if let Some(reply) = reply {
+            self.tell(Event::Reply(reply));
+        }
+    }
+
+    fn perform(&mut self) {
+        while let Some(action) = self.bus.next_action() {
+            match action {
+                Action::Send { .. } if !matches!(self.port, Port::Open) => {
+                    self.bus.handle(self.now, Event::LinkDown("the link is not open".into()));
+                }
+                Action::Send { request, not_before, timeout } => {
+                    match self.guard.begin(self.now, &request, timeout) {
+                        Some(reply) => self.bus.handle(self.now, Event::Reply(reply)),
+                        None => self.to_send = Some(not_before),
+                    }
+                }
+                Action::Publish(message) => {
+                    self.published.push(Published { message, at: self.now, asked_at: self.asked_at });
+                }
+                Action::Reopen { after } => {
+                    self.close(self.now + after);
+                }
+                Action::Store(_) | Action::Say(..) => {}
+            }
+        }
+    }
+
+    fn close(&mut self, until: Time) {
+        self.port = Port::OpensAt(until);
+        self.guard = Guard::new(&self.settings.buses[0].link, None);
+        self.to_send = None;
+        self.coming.clear();
+    }
+}
