@@ -112,15 +112,13 @@ mod tests {
             profile: "test".into(),
             unit: 1,
             online: true,
-            reason: None,
-            identity: None,
             counters: Counters { timeouts: 7, ..Counters::default() },
-            last_answer_at: None,
-            points: Vec::new(),
+            ..DeviceReport::default()
         };
         let report = BusReport {
             name: "cellar".into(),
             link: "tcp".into(),
+            line: None,
             up: true,
             reason: None,
             counters: Counters { requests: 12, ..Counters::default() },

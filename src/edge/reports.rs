@@ -59,6 +59,7 @@ mod tests {
         BusReport {
             name: name.into(),
             link: "tcp".into(),
+            line: None,
             up: true,
             reason: None,
             counters: Counters { requests, ..Counters::default() },

@@ -1,11 +1,11 @@
 //! What a bus and its devices say of themselves: counters, states and reasons.
 
-use std::collections::BTreeSet;
+mod json;
 
-use serde_json::{Map, Value, json};
+pub use json::{device_json, info_json, point_json, seconds};
 
+use crate::engine::device::{Category, Point, Poll};
 use crate::engine::modbus::{Discarded, RequestError};
-use crate::engine::settings::Settings;
 use crate::engine::time::{Duration, Time};
 
 /// What happened on the wire, each error counted as what it was.
@@ -79,6 +79,8 @@ pub struct BusReport {
     pub name: String,
     /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`
     pub link: String,
+    /// `19200 8E1`; nothing where no serial line is known of.
+    pub line: Option<String>,
     pub up: bool,
     /// Why the link is down.
     pub reason: Option<String>,
@@ -89,11 +91,13 @@ pub struct BusReport {
 }
 
 /// A device as it is now.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct DeviceReport {
     pub name: String,
     pub title: String,
     pub profile: String,
+    pub manufacturer: String,
+    pub model: String,
     pub unit: u8,
     pub online: bool,
     /// Why it is offline, or what is wrong with it although it answers.
@@ -102,46 +106,145 @@ pub struct DeviceReport {
     pub identity: Option<String>,
     pub counters: Counters,
     pub last_answer_at: Option<Time>,
+    pub periods: Vec<PeriodReport>,
     pub points: Vec<PointReport>,
+    pub things: Vec<ThingReport>,
+}
+
+/// How often a device is read: as it was asked for, and as it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PeriodReport {
+    pub class: Poll,
+    pub wanted: Duration,
+    /// `None`: not yet measured.
+    pub real: Option<Duration>,
 }
 
 /// A point as it was last told.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PointReport {
     pub name: String,
-    /// As published: `21.5`, `ON`, `None`.
+    /// What people call it.
+    pub title: String,
+    pub role: Role,
+    /// As published: `21.5`, `ON`, `None`. Of an event: its type, if it has happened.
     pub value: String,
+    /// The value is `[1.5,null,…]`.
+    pub is_list: bool,
     pub unit: Option<String>,
-    /// Why it is `None`.
-    pub reason: Option<String>,
+    /// Why it is `None`: a word for programs and a text for people.
+    pub missing: Option<(&'static str, String)>,
+    /// Of an event: when it happened.
     pub read_at: Option<Time>,
+    /// So long after it was read it should have been read again; `None`: it is read once, or on request.
+    pub good_for: Option<Duration>,
 }
 
-/// `bridge/info`: what the gateway is and what it was told to do, without secrets.
-pub fn info_json(settings: &Settings) -> Value {
-    let buses: Map<String, Value> =
-        settings.buses.iter().map(|bus| (bus.name.clone(), bus.link.to_string().into())).collect();
-    let devices: Map<String, Value> = settings
-        .devices
-        .iter()
-        .map(|device| {
-            let about = json!({
-                "name": device.title,
-                "profile": device.device.profile,
-                "bus": settings.buses[device.bus].name,
-                "unit": device.unit,
-            });
-            (device.name.clone(), about)
-        })
-        .collect();
-    let profiles: BTreeSet<&str> =
-        settings.devices.iter().map(|device| device.device.profile.as_str()).collect();
-    json!({
-        "version": env!("CARGO_PKG_VERSION"),
-        "buses": buses,
-        "devices": devices,
-        "profiles": profiles,
-    })
+/// What a point is to a person who looks at the device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    Value,
+    Event,
+    Setting,
+    Diagnostic,
+}
+
+impl Role {
+    pub fn of(point: &Point) -> Role {
+        let looks = &point.presentation;
+        if point.event.is_some() {
+            return Role::Event;
+        }
+        match looks.category {
+            Some(Category::Config) => Role::Setting,
+            Some(Category::Diagnostic) => Role::Diagnostic,
+            None if point.persistent => Role::Setting,
+            None if looks.enabled == Some(false) || point.poll == Poll::Once => Role::Diagnostic,
+            None => Role::Value,
+        }
+    }
+
+    pub const fn name(self) -> &'static str {
+        match self {
+            Role::Value => "value",
+            Role::Event => "event",
+            Role::Setting => "setting",
+            Role::Diagnostic => "diagnostic",
+        }
+    }
+}
+
+/// How far a reading can be believed to be the present one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Freshness {
+    /// Read as often as it should be.
+    Fresh,
+    /// Read once, or when somebody asked: it was true then.
+    Kept,
+    /// It should have been read again.
+    Old,
+    /// There is none.
+    Missing,
+}
+
+impl Freshness {
+    pub const fn name(self) -> &'static str {
+        match self {
+            Freshness::Fresh => "fresh",
+            Freshness::Kept => "kept",
+            Freshness::Old => "old",
+            Freshness::Missing => "missing",
+        }
+    }
+}
+
+impl PointReport {
+    /// `is_heard`: whether the bus that tells this has just answered for itself.
+    pub fn freshness(&self, now: Time, is_heard: bool) -> Freshness {
+        match (self.read_at, self.good_for) {
+            _ if self.missing.is_some() => Freshness::Missing,
+            _ if !is_heard => Freshness::Old,
+            (Some(read_at), Some(good_for)) if now - read_at <= good_for => Freshness::Fresh,
+            (_, Some(_)) => Freshness::Old,
+            (_, None) => Freshness::Kept,
+        }
+    }
+}
+
+/// A reading of this period is good until three turns have been missed, and a second for what a retry
+/// takes: a device that has fallen silent is offline by then.
+pub fn good_for(period: Duration) -> Duration {
+    period * 3 + Duration::from_secs(1)
+}
+
+/// A thing made of several points, as its points say.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ThingReport {
+    pub name: String,
+    pub title: String,
+    /// `cover`, `climate`
+    pub kind: &'static str,
+    pub state: Option<String>,
+    /// Why there is no state.
+    pub reason: Option<String>,
+    /// The names of the points that its state is made of.
+    pub made_of: Vec<String>,
+    /// The names of a climate's points with the present and the wanted temperature.
+    pub temperature: Option<String>,
+    pub target: Option<String>,
+}
+
+impl ThingReport {
+    /// No fresher than what it is made of.
+    pub fn freshness(&self, device: &DeviceReport, now: Time, is_heard: bool) -> Freshness {
+        if self.state.is_none() {
+            return Freshness::Missing;
+        }
+        let parts = device.points.iter().filter(|point| self.made_of.contains(&point.name));
+        // A point that is missing decides nothing while another one's row holds.
+        let known = parts.map(|point| point.freshness(now, is_heard)).filter(|of| *of != Freshness::Missing);
+        known.max().unwrap_or(Freshness::Missing)
+    }
 }
 
 /// The whole gateway as it is now.
@@ -209,117 +312,16 @@ impl GatewayReport {
         }
     }
 
-    /// `bridge/health` and, with the broker, `GET /health`: the state of everything, by name.
-    pub fn to_json(&self) -> Value {
-        let buses: Map<String, Value> =
-            self.buses.iter().map(|bus| (bus.report.name.clone(), bus_json(bus))).collect();
-        let devices: Map<String, Value> = self
-            .devices()
-            .map(|(bus, device)| {
-                let mut value = object(json!({
-                    "online": device.online,
-                    "reason": device.reason,
-                    "bus": bus.name,
-                    "unit": device.unit,
-                }));
-                value.extend(counters_json(&device.counters));
-                (device.name.clone(), value.into())
-            })
-            .collect();
-        json!({
-            "status": self.status().name(),
-            "broker": {
-                "connected": self.broker.connected,
-                "reason": self.broker.reason,
-                "connects": self.broker.connects,
-                "dropped": self.broker.dropped,
-            },
-            "buses": buses,
-            "devices": devices,
-        })
-    }
-
-    /// `GET /api/buses`: a list.
-    pub fn buses_json(&self) -> Value {
-        let named = |bus: &BusHealth| {
-            let mut value = object(json!({"name": bus.report.name}));
-            value.extend(object(bus_json(bus)));
-            let devices: Vec<&str> = bus.report.devices.iter().map(|device| device.name.as_str()).collect();
-            value.insert("devices".into(), devices.into());
-            Value::Object(value)
-        };
-        self.buses.iter().map(named).collect()
-    }
-
-    /// `GET /api/devices`: a list, with the points as they were last told.
-    pub fn devices_json(&self, now: Time) -> Value {
-        self.devices()
-            .map(|(bus, device)| {
-                let points: Vec<Value> = device.points.iter().map(|point| point_json(point, now)).collect();
-                json!({
-                    "name": device.name,
-                    "title": device.title,
-                    "profile": device.profile,
-                    "bus": bus.name,
-                    "unit": device.unit,
-                    "online": device.online,
-                    "reason": device.reason,
-                    "identity": device.identity,
-                    "last_answer_seconds_ago": device.last_answer_at.map(|at| seconds(now - at)),
-                    "counters": counters_json(&device.counters),
-                    "points": points,
-                })
-            })
-            .collect()
-    }
-
     /// Every device with its bus.
     pub fn devices(&self) -> impl Iterator<Item = (&BusReport, &DeviceReport)> {
         self.buses.iter().flat_map(|bus| bus.report.devices.iter().map(|device| (&bus.report, device)))
     }
 }
 
-fn bus_json(bus: &BusHealth) -> Value {
-    let report = &bus.report;
-    let mut value = object(json!({
-        "link": report.link,
-        "up": report.up,
-        "reason": report.reason,
-        "responding": bus.responding,
-        "load": (report.load * 1000.0).round() / 1000.0,
-    }));
-    value.extend(counters_json(&report.counters));
-    value.into()
-}
-
-fn counters_json(counters: &Counters) -> Map<String, Value> {
-    counters.list().into_iter().map(|(name, count)| (name.to_string(), count.into())).collect()
-}
-
-fn point_json(point: &PointReport, now: Time) -> Value {
-    json!({
-        "name": point.name,
-        "value": point.value,
-        "unit": point.unit,
-        "reason": point.reason,
-        "read_seconds_ago": point.read_at.map(|at| seconds(now - at)),
-    })
-}
-
-/// With the digits that mean something.
-fn seconds(duration: Duration) -> f64 {
-    (duration.as_secs_f64() * 1000.0).round() / 1000.0
-}
-
-fn object(value: Value) -> Map<String, Value> {
-    match value {
-        Value::Object(map) => map,
-        _ => Map::new(),
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     fn device(name: &str, online: bool) -> DeviceReport {
@@ -330,16 +332,26 @@ mod tests {
             unit: 1,
             online,
             reason: (!online).then(|| "no answer in time".into()),
-            identity: None,
             counters: Counters { timeouts: 3, ..Counters::default() },
             last_answer_at: Some(Time::from_millis(1000)),
-            points: vec![PointReport {
-                name: "flow".into(),
-                value: "21.5".into(),
-                unit: Some("°C".into()),
-                reason: None,
-                read_at: Some(Time::from_millis(1500)),
-            }],
+            periods: vec![PeriodReport { class: Poll::Fast, wanted: Duration::from_secs(1), real: None }],
+            points: vec![flow()],
+            ..DeviceReport::default()
+        }
+    }
+
+    /// A point that is read each second.
+    fn flow() -> PointReport {
+        PointReport {
+            name: "flow".into(),
+            title: "Flow".into(),
+            role: Role::Value,
+            value: "21.5".into(),
+            is_list: false,
+            unit: Some("°C".into()),
+            missing: None,
+            read_at: Some(Time::from_millis(1500)),
+            good_for: Some(good_for(Duration::from_secs(1))),
         }
     }
 
@@ -348,6 +360,7 @@ mod tests {
         let report = BusReport {
             name: "cellar".into(),
             link: "tcp 127.0.0.1:502".into(),
+            line: None,
             up,
             reason: None,
             counters: Counters::default(),
@@ -389,5 +402,62 @@ mod tests {
         assert_eq!(device["last_answer_seconds_ago"], 1.0);
         assert_eq!(device["points"][0]["value"], "21.5");
         assert_eq!(device["points"][0]["read_seconds_ago"], 0.5);
+    }
+    #[test]
+    fn only_what_was_read_in_time_on_a_bus_that_is_heard_is_fresh() {
+        let missing = Some(("offline", "the device does not answer".to_string()));
+        for (what, point, seconds, is_heard, expected) in [
+            ("just read", flow(), 2, true, Freshness::Fresh),
+            ("three turns missed", flow(), 6, true, Freshness::Old),
+            ("a stuck bus", flow(), 2, false, Freshness::Old),
+            ("lost, if only just", PointReport { missing, ..flow() }, 2, true, Freshness::Missing),
+            ("on request", PointReport { good_for: None, ..flow() }, 9000, true, Freshness::Kept),
+            ("never read", PointReport { read_at: None, ..flow() }, 2, true, Freshness::Old),
+        ] {
+            assert_eq!(point.freshness(Time::from_millis(seconds * 1000), is_heard), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn a_thing_is_no_fresher_than_what_it_is_made_of() {
+        let late = PointReport { name: "late".into(), read_at: Some(Time::default()), ..flow() };
+        let lost =
+            PointReport { name: "lost".into(), missing: Some(("exception", "exception 4".into())), ..flow() };
+        let device = DeviceReport { points: vec![flow(), late, lost], ..DeviceReport::default() };
+        let thing = |state: Option<&str>, made_of: &[&str]| ThingReport {
+            name: "blind".into(),
+            title: "Blind".into(),
+            kind: "cover",
+            state: state.map(str::to_string),
+            reason: None,
+            made_of: made_of.iter().map(|name| name.to_string()).collect(),
+            temperature: None,
+            target: None,
+        };
+        for (thing, expected) in [
+            (thing(Some("open"), &["flow"]), Freshness::Fresh),
+            (thing(Some("open"), &["flow", "late"]), Freshness::Old),
+            (thing(Some("open"), &["flow", "lost"]), Freshness::Fresh),
+            (thing(None, &["flow"]), Freshness::Missing),
+        ] {
+            assert_eq!(thing.freshness(&device, Time::from_millis(5000), true), expected, "{thing:?}");
+        }
+    }
+
+    #[test]
+    fn a_list_is_told_as_text_and_as_numbers_and_what_is_missing_stays_missing() {
+        let point = PointReport { value: "[1.5,null,-2]".into(), is_list: true, ..flow() };
+        let told = json::point_json(&point, Time::from_millis(2000), true);
+        assert_eq!(told["list"], json!([1.5, null, -2]));
+        assert_eq!(told["value"], "[1.5,null,-2]");
+        let unread = PointReport {
+            value: "None".into(),
+            missing: Some(("not_yet_read", "not yet read".into())),
+            read_at: None,
+            ..flow()
+        };
+        let told = json::point_json(&unread, Time::from_millis(2000), true);
+        assert_eq!(told["read_seconds_ago"], json!(null), "an age that is not known is no 0");
+        assert_eq!(told["missing"], "not_yet_read");
     }
 }

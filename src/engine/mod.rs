@@ -28,7 +28,8 @@ pub mod schedule;
 pub mod identity;
 pub mod state;
 
-// Tell: topics, discovery, health, and what waits for the broker.
+// Tell: topics, discovery, health, and what waits for the broker or has changed for who watches.
+pub mod feed;
 pub mod health;
 pub mod homeassistant;
 pub mod outbox;

@@ -23,6 +23,10 @@ struct Planned {
     /// Some point in it decides how others are read.
     has_selector: bool,
     began_at: Option<Time>,
+    /// The same without the shift that keeps the period on average.
+    sent_at: Option<Time>,
+    /// How long after the one before it the last read began by its period.
+    real_period: Option<Duration>,
     wanted_now: bool,
     /// Has been answered since the device connected, if only with an exception.
     tried: bool,
@@ -53,6 +57,8 @@ impl Polls {
             has_selector: read.points.iter().any(|(point, _)| is_selector(*point)),
             read,
             began_at: None,
+            sent_at: None,
+            real_period: None,
             wanted_now: true,
             tried: false,
             paused_until: Time::default(),
@@ -92,7 +98,23 @@ impl Polls {
             Some((due, period)) if !planned.wanted_now && due <= now && now - due < period => Some(due),
             _ => Some(now),
         };
+        // A read that was wanted out of turn says nothing about the turns.
+        if !planned.wanted_now {
+            planned.real_period = planned.sent_at.map(|sent_at| now - sent_at);
+        }
+        planned.sent_at = Some(now);
         planned.wanted_now = false;
+    }
+
+    /// The poll class's period as the bus keeps it now: that of the slowest of its reads, a read that
+    /// is late included. `None` while no read has come round, or if there is none.
+    pub fn real_period(&self, class: Poll, now: Time) -> Option<Duration> {
+        let of_class = self.reads.iter().filter(|planned| planned.read.poll == class && !planned.sleeps);
+        let lasting = |planned: &Planned| {
+            let waits = planned.sent_at.map(|sent_at| now - sent_at);
+            planned.real_period.map(|period| waits.map_or(period, |waits| period.max(waits)))
+        };
+        of_class.filter_map(lasting).max()
     }
 
     /// The read has been answered, if only with an exception.
@@ -126,6 +148,9 @@ impl Polls {
             planned.wanted_now = true;
             planned.tried = false;
             planned.paused_until = Time::default();
+            // Nobody kept a period while the device was away.
+            planned.sent_at = None;
+            planned.real_period = None;
         }
     }
 
@@ -156,6 +181,8 @@ impl Polls {
         for planned in &mut self.reads {
             if let Some(before) = known(planned.read.span, planned.read.poll) {
                 planned.began_at = before.began_at;
+                planned.sent_at = before.sent_at;
+                planned.real_period = before.real_period;
                 planned.wanted_now = before.wanted_now;
                 planned.tried = before.tried;
                 planned.paused_until = before.paused_until;
@@ -226,6 +253,21 @@ mod tests {
     fn every_period_is_kept_on_a_bus_with_time_to_spare() {
         let mut polls = polls(&[Poll::Fast, Poll::Slow, Poll::Once]);
         assert_eq!(run(&mut polls, Duration::from_millis(5), Time::from_millis(10_000)), [100, 10, 1]);
+    }
+
+    #[test]
+    fn the_real_period_is_what_the_bus_keeps_and_not_what_was_asked_for() {
+        let fast = |polls: &Polls, now| polls.real_period(Poll::Fast, now).map(|period| period.as_millis());
+        let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
+        polls.begin(0, Time::default());
+        assert_eq!(fast(&polls, Time::from_millis(50)), None, "nothing has come round");
+        run(&mut polls, Duration::from_millis(5), Time::from_millis(10_000));
+        assert_eq!(fast(&polls, Time::from_millis(10_000)), Some(100));
+        run(&mut polls, Duration::from_millis(100), Time::from_millis(100_000));
+        assert!(fast(&polls, Time::from_millis(100_000)) >= Some(200));
+        assert!(fast(&polls, Time::from_millis(700_000)) >= Some(600_000), "what is late counts");
+        polls.want_all();
+        assert_eq!(fast(&polls, Time::from_millis(700_000)), None);
     }
 
     #[test]

@@ -99,6 +99,16 @@ pub enum Link {
     RtuOverTcp { host: String, port: u16, line: Line },
 }
 
+impl Link {
+    /// The characters on the serial line, where there is one.
+    pub const fn line(&self) -> Option<Line> {
+        match self {
+            Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } => Some(*line),
+            Link::Tcp { .. } => None,
+        }
+    }
+}
+
 impl fmt::Display for Link {
     /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`, `rtu over tcp 192.168.1.21:4196`
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

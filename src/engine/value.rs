@@ -177,6 +177,23 @@ pub enum Missing {
     Exception(u8),
 }
 
+impl Missing {
+    /// A word for programs.
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Missing::NotYetRead => "not_yet_read",
+            Missing::Offline => "offline",
+            Missing::WaitingFor(_) => "waiting",
+            Missing::NotInThisMode => "not_in_this_mode",
+            Missing::Invalid(_) => "invalid",
+            Missing::UnknownValue(_) => "unknown_value",
+            Missing::NotANumber => "not_a_number",
+            Missing::NotText => "not_text",
+            Missing::Exception(_) => "exception",
+        }
+    }
+}
+
 impl fmt::Display for Missing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

@@ -11,7 +11,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
     &["yaml", "device", "test_device", "codec", "units", "settings", "profile", "wanted", "configuration"],
     &["modbus", "plan", "schedule"],
     &["identity", "state"],
-    &["topics", "health", "homeassistant", "outbox"],
+    &["topics", "health", "feed", "homeassistant", "outbox"],
     &["command", "memory", "upkeep", "bus"],
 ];
 

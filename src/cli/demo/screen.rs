@@ -156,8 +156,8 @@ impl Screen {
     fn values<'r>(&'r self, device: &'r DeviceReport) -> impl Iterator<Item = (&'r str, String)> {
         let shown = self.shown.get(&device.name).map_or([].as_slice(), Vec::as_slice);
         device.points.iter().filter(|point| shown.contains(&point.name)).map(|point| {
-            let value = match (&point.unit, &point.reason) {
-                (_, Some(reason)) => format!("- ({reason})"),
+            let value = match (&point.unit, &point.missing) {
+                (_, Some((_, reason))) => format!("- ({reason})"),
                 (Some(unit), None) => format!("{} {unit}", point.value),
                 (None, None) => point.value.clone(),
             };

@@ -5,8 +5,11 @@ mod fetching;
 mod keeping;
 mod obeying;
 mod patience;
+mod reporting;
 mod telling;
 mod wear;
+
+use std::collections::BTreeMap;
 
 use crate::engine::address::Span;
 use crate::engine::codec;
@@ -71,6 +74,8 @@ pub(super) struct DeviceState {
     /// What each thing was last told to be, and when.
     told_things: Vec<Option<(String, Time)>>,
     beats: Beats,
+    /// When the points that tell events last did.
+    happened: BTreeMap<PointIndex, Time>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -120,6 +125,7 @@ impl DeviceState {
             warned_of_retained: Vec::new(),
             told_things: vec![None; settings.device.things.len()],
             beats: Beats::new(&settings.device),
+            happened: BTreeMap::new(),
             settings,
         }
     }

@@ -277,11 +277,12 @@ impl Bus {
         BusReport {
             name: self.name.clone(),
             link: self.link.to_string(),
+            line: self.link.line().map(|line| line.to_string()),
             up: matches!(self.link_state, LinkState::Up | LinkState::Renewing),
             reason,
             counters: self.counters,
             load: self.load.share(now),
-            devices: self.devices.iter().map(DeviceState::report).collect(),
+            devices: self.devices.iter().map(|device| device.report(now)).collect(),
         }
     }
 

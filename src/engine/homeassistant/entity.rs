@@ -320,7 +320,7 @@ fn slug(text: &str) -> String {
 }
 
 /// `channel_3_value` as people write it: `Channel 3 value`.
-pub(super) fn sentence(name: &str) -> String {
+pub fn sentence(name: &str) -> String {
     let words = name.replace('_', " ");
     let mut letters = words.chars();
     letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())

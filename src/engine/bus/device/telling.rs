@@ -5,7 +5,6 @@ use serde_json::json;
 
 use crate::engine::codec;
 use crate::engine::device::{PointIndex, Thing};
-use crate::engine::health::{DeviceReport, PointReport};
 use crate::engine::homeassistant;
 use crate::engine::time::Time;
 use crate::engine::topics::{Message, OFFLINE, ONLINE};
@@ -28,6 +27,7 @@ impl DeviceState {
         }
         if let Some(event) = &details.event {
             if self.values.take_flip(now, point) {
+                self.happened.insert(point, now);
                 let topic = context.gateway.topics.state(&self.settings.name, &details.name);
                 context.publish(Message::once(topic, json!({"event_type": event}).to_string()));
             }
@@ -59,7 +59,7 @@ impl DeviceState {
     }
 
     /// The first of the thing's states whose row holds; `None` if none does, or if it does not live.
-    fn state_of<'t>(&self, thing: &'t Thing) -> Option<&'t str> {
+    pub(super) fn state_of<'t>(&self, thing: &'t Thing) -> Option<&'t str> {
         if codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
             return None;
         }
@@ -169,37 +169,5 @@ impl DeviceState {
             context.publish(Message::retained(topic, info.clone()));
             self.told_info = info;
         }
-    }
-
-    pub(in crate::engine::bus) fn report(&self) -> DeviceReport {
-        let points = self.settings.device.points.iter().enumerate().filter(|(_, point)| !point.is_button());
-        DeviceReport {
-            name: self.settings.name.clone(),
-            title: self.settings.title.clone(),
-            profile: self.settings.device.profile.clone(),
-            unit: self.settings.unit,
-            online: self.told_available == Some(true),
-            reason: self.reason(),
-            identity: self.identity.clone(),
-            counters: self.counters,
-            last_answer_at: self.last_answer_at,
-            points: points
-                .map(|(index, point)| PointReport {
-                    name: point.name.clone(),
-                    value: self.values.reading(index).to_string(),
-                    unit: self.unit_of(index),
-                    reason: match self.values.reading(index) {
-                        Reading::Missing(missing) => Some(missing.to_string()),
-                        _ => None,
-                    },
-                    read_at: self.values.read_at(index),
-                })
-                .collect(),
-        }
-    }
-
-    /// The unit of a point as it is told now.
-    fn unit_of(&self, point: PointIndex) -> Option<String> {
-        codec::resolve(self.device(), point, self.known()).ok().and_then(|resolved| resolved.unit)
     }
 }

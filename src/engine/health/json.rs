@@ -1,0 +1,198 @@
+//! The reports as JSON, for HTTP and MQTT.
+
+use std::collections::BTreeSet;
+
+use serde_json::{Map, Value, json};
+
+use super::{BusHealth, Counters, DeviceReport, GatewayReport, PointReport, ThingReport};
+use crate::engine::settings::Settings;
+use crate::engine::time::{Duration, Time};
+
+/// `bridge/info`: what the gateway is and what it was told to do, without secrets.
+pub fn info_json(settings: &Settings) -> Value {
+    let buses: Map<String, Value> =
+        settings.buses.iter().map(|bus| (bus.name.clone(), bus.link.to_string().into())).collect();
+    let devices: Map<String, Value> = settings
+        .devices
+        .iter()
+        .map(|device| {
+            let about = json!({
+                "name": device.title,
+                "profile": device.device.profile,
+                "bus": settings.buses[device.bus].name,
+                "unit": device.unit,
+            });
+            (device.name.clone(), about)
+        })
+        .collect();
+    let profiles: BTreeSet<&str> =
+        settings.devices.iter().map(|device| device.device.profile.as_str()).collect();
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "buses": buses,
+        "devices": devices,
+        "profiles": profiles,
+    })
+}
+
+impl GatewayReport {
+    /// `bridge/health` and, with the broker, `GET /health`: the state of everything, by name.
+    pub fn to_json(&self) -> Value {
+        let buses: Map<String, Value> =
+            self.buses.iter().map(|bus| (bus.report.name.clone(), bus_json(bus))).collect();
+        let devices: Map<String, Value> = self
+            .devices()
+            .map(|(bus, device)| {
+                let mut value = object(json!({
+                    "online": device.online,
+                    "reason": device.reason,
+                    "bus": bus.name,
+                    "unit": device.unit,
+                }));
+                value.extend(counters_json(&device.counters));
+                (device.name.clone(), value.into())
+            })
+            .collect();
+        let mut value = object(self.summary_json());
+        value.insert("buses".into(), buses.into());
+        value.insert("devices".into(), devices.into());
+        value.into()
+    }
+
+    /// The gateway in one line, and its broker.
+    pub fn summary_json(&self) -> Value {
+        json!({
+            "status": self.status().name(),
+            "broker": {
+                "connected": self.broker.connected,
+                "reason": self.broker.reason,
+                "connects": self.broker.connects,
+                "dropped": self.broker.dropped,
+            },
+        })
+    }
+
+    /// `GET /api/buses`: a list.
+    pub fn buses_json(&self) -> Value {
+        self.buses.iter().map(BusHealth::named_json).collect()
+    }
+
+    /// `GET /api/devices`: a list, with the points as they were last told.
+    pub fn devices_json(&self, now: Time) -> Value {
+        let of_bus = |bus: &BusHealth| -> Vec<Value> {
+            let with_points = |device: &DeviceReport| {
+                let mut value = object(device_json(bus, device, now));
+                let points = device.points.iter().map(|point| point_json(point, now, bus.responding));
+                value.insert("points".into(), points.collect());
+                value.into()
+            };
+            bus.report.devices.iter().map(with_points).collect()
+        };
+        self.buses.iter().flat_map(of_bus).collect()
+    }
+}
+
+impl BusHealth {
+    /// One entry of `GET /api/buses`.
+    pub fn named_json(&self) -> Value {
+        let mut value = object(json!({"name": self.report.name}));
+        value.extend(object(bus_json(self)));
+        let devices: Vec<&str> = self.report.devices.iter().map(|device| device.name.as_str()).collect();
+        value.insert("devices".into(), devices.into());
+        value.into()
+    }
+}
+
+fn bus_json(bus: &BusHealth) -> Value {
+    let report = &bus.report;
+    let mut value = object(json!({
+        "link": report.link,
+        "line": report.line,
+        "up": report.up,
+        "reason": report.reason,
+        "responding": bus.responding,
+        "load": (report.load * 1000.0).round() / 1000.0,
+    }));
+    value.extend(counters_json(&report.counters));
+    value.into()
+}
+
+/// Everything of a device but its points.
+pub fn device_json(bus: &BusHealth, device: &DeviceReport, now: Time) -> Value {
+    let periods: Map<String, Value> = device
+        .periods
+        .iter()
+        .map(|period| {
+            let told = json!({"wanted_seconds": seconds(period.wanted), "seconds": period.real.map(seconds)});
+            (period.class.name().to_string(), told)
+        })
+        .collect();
+    let things: Vec<Value> =
+        device.things.iter().map(|thing| thing_json(thing, device, now, bus.responding)).collect();
+    json!({
+        "name": device.name,
+        "title": device.title,
+        "profile": device.profile,
+        "manufacturer": device.manufacturer,
+        "model": device.model,
+        "bus": bus.report.name,
+        "unit": device.unit,
+        "online": device.online,
+        "reason": device.reason,
+        "identity": device.identity,
+        "last_answer_seconds_ago": device.last_answer_at.map(|at| seconds(now - at)),
+        "periods": periods,
+        "counters": counters_json(&device.counters),
+        "things": things,
+    })
+}
+
+fn counters_json(counters: &Counters) -> Map<String, Value> {
+    counters.list().into_iter().map(|(name, count)| (name.to_string(), count.into())).collect()
+}
+
+/// One point; `is_heard` as in [`PointReport::freshness`].
+pub fn point_json(point: &PointReport, now: Time, is_heard: bool) -> Value {
+    let (missing, reason) = point.missing.as_ref().map(|(word, text)| (*word, text.as_str())).unzip();
+    let mut value = json!({
+        "name": point.name,
+        "title": point.title,
+        "role": point.role.name(),
+        "value": point.value,
+        "unit": point.unit,
+        "freshness": point.freshness(now, is_heard).name(),
+        "missing": missing,
+        "reason": reason,
+        "read_seconds_ago": point.read_at.map(|at| seconds(now - at)),
+    });
+    if point.is_list {
+        // The text of a list of numbers is JSON.
+        value["list"] = serde_json::from_str(&point.value).unwrap_or_default();
+    }
+    value
+}
+
+fn thing_json(thing: &ThingReport, device: &DeviceReport, now: Time, is_heard: bool) -> Value {
+    json!({
+        "name": thing.name,
+        "title": thing.title,
+        "kind": thing.kind,
+        "state": thing.state,
+        "freshness": thing.freshness(device, now, is_heard).name(),
+        "reason": thing.reason,
+        "temperature": thing.temperature,
+        "target": thing.target,
+    })
+}
+
+/// With the digits that mean something.
+pub fn seconds(duration: Duration) -> f64 {
+    (duration.as_secs_f64() * 1000.0).round() / 1000.0
+}
+
+fn object(value: Value) -> Map<String, Value> {
+    match value {
+        Value::Object(map) => map,
+        _ => Map::new(),
+    }
+}
