@@ -58,9 +58,12 @@ pub fn load(path: &Path) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
     }
     match configuration::load(&shown, &bytes, &library) {
         Ok((mut settings, warnings)) if unreadable.is_empty() => {
-            let environment = env::var("BUSKER_MQTT_PASSWORD").ok();
-            let credentials = env::var_os("CREDENTIALS_DIRECTORY").map(PathBuf::from);
-            settings.mqtt.password = password(settings.mqtt.password, environment, credentials);
+            let secret = |configured, variable, credential| {
+                let folder = env::var_os("CREDENTIALS_DIRECTORY").map(PathBuf::from);
+                nearest(configured, env::var(variable).ok(), folder.map(|folder| folder.join(credential)))
+            };
+            settings.mqtt.password = secret(settings.mqtt.password, "BUSKER_MQTT_PASSWORD", "mqtt-password");
+            settings.http.token = secret(settings.http.token, "BUSKER_HTTP_TOKEN", "http-token");
             Ok(Ok(Loaded { settings, warnings, library }))
         }
         Ok(_) => Ok(Err(unreadable)),
@@ -89,10 +92,9 @@ pub fn add_profiles(library: &mut Library, root: &Path, folder: &Path) -> std::i
     Ok(())
 }
 
-/// The configuration's password, else that of the environment, else systemd's credential.
-fn password(configured: Password, environment: Option<String>, credentials: Option<PathBuf>) -> Password {
-    let credential = credentials.map(|folder| folder.join("mqtt-password")).filter(|path| path.exists());
-    match (configured, environment, credential) {
+/// The configuration's secret, else that of the environment, else systemd's credential, if it is there.
+fn nearest(configured: Password, environment: Option<String>, credential: Option<PathBuf>) -> Password {
+    match (configured, environment, credential.filter(|path| path.exists())) {
         (Password::None, Some(password), _) => Password::Given(password),
         (Password::None, None, Some(path)) => Password::File(path),
         (configured, _, _) => configured,
@@ -106,14 +108,14 @@ mod tests {
     #[test]
     fn the_password_comes_from_the_nearest_place_that_has_one() {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let credentials = || Some(folder.path().to_path_buf());
+        let credential = || Some(folder.path().join("mqtt-password"));
         let given = |password: &str| Password::Given(password.into());
-        assert!(password(Password::None, None, None) == Password::None);
-        assert!(password(Password::None, None, credentials()) == Password::None);
+        assert!(nearest(Password::None, None, None) == Password::None);
+        assert!(nearest(Password::None, None, credential()) == Password::None);
         fs::write(folder.path().join("mqtt-password"), "c").expect("a credential");
         let file = Password::File(folder.path().join("mqtt-password"));
-        assert!(password(Password::None, None, credentials()) == file);
-        assert!(password(Password::None, Some("e".into()), credentials()) == given("e"));
-        assert!(password(given("f"), Some("e".into()), credentials()) == given("f"));
+        assert!(nearest(Password::None, None, credential()) == file);
+        assert!(nearest(Password::None, Some("e".into()), credential()) == given("e"));
+        assert!(nearest(given("f"), Some("e".into()), credential()) == given("f"));
     }
 }

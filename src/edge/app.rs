@@ -49,7 +49,8 @@ impl App {
     /// Starts everything, going on from what is remembered in `state`. An error means that nothing is left
     /// running.
     pub fn start(settings: Settings, state: StateFiles) -> anyhow::Result<App> {
-        let password = files::read_password(&settings.mqtt.password)?;
+        let password = files::read_secret("password", &settings.mqtt.password)?;
+        let token = files::read_token(&settings.http.token)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .thread_name("edge")
@@ -80,7 +81,7 @@ impl App {
             .collect();
         let connection = broker.state();
         let reporter = Arc::new(Reporter::new(move || connection.report(), questions(&buses), first));
-        let http = listener.map(|listener| Http::serve(listener, reporter.clone(), clock));
+        let http = listener.map(|listener| Http::serve(listener, reporter.clone(), clock, token));
         let watch = tokio::spawn(watch(reporter.clone(), topics, mailbox));
         Ok(App { runtime, buses, broker, http, reporter, watch, state })
     }

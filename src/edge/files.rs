@@ -4,23 +4,37 @@ use std::fs;
 
 use anyhow::{Context, bail};
 
-use crate::engine::settings::Password;
+use crate::engine::settings::{self, Password};
 
-/// The broker's password. One line end behind it in a file is no part of it.
-pub fn read_password(password: &Password) -> anyhow::Result<Option<String>> {
-    let path = match password {
+/// The secret that messages call `what`: a password or a token. One line end behind it in a file is no
+/// part of it.
+pub fn read_secret(what: &str, secret: &Password) -> anyhow::Result<Option<String>> {
+    let path = match secret {
         Password::None => return Ok(None),
-        Password::Given(password) => return Ok(Some(password.clone())),
+        Password::Given(secret) => return Ok(Some(secret.clone())),
         Password::File(path) => path,
     };
     let shown = path.display();
-    let text = fs::read_to_string(path).with_context(|| format!("cannot read the password in `{shown}`"))?;
-    let password = text.strip_suffix('\n').unwrap_or(&text);
-    let password = password.strip_suffix('\r').unwrap_or(password);
-    if password.is_empty() {
-        bail!("the password file `{shown}` is empty");
+    let text = fs::read_to_string(path).with_context(|| format!("cannot read the {what} in `{shown}`"))?;
+    let secret = text.strip_suffix('\n').unwrap_or(&text);
+    let secret = secret.strip_suffix('\r').unwrap_or(secret);
+    if secret.is_empty() {
+        bail!("the {what} file `{shown}` is empty");
     }
-    Ok(Some(password.to_string()))
+    Ok(Some(secret.to_string()))
+}
+
+/// The token that readers of HTTP must know.
+pub fn read_token(token: &Password) -> anyhow::Result<Option<String>> {
+    let found = read_secret("token", token)?;
+    if found.as_deref().is_some_and(|found| !settings::is_token(found)) {
+        let place = match token {
+            Password::File(path) => format!("the first line of `{}`", path.display()),
+            _ => "the token".into(),
+        };
+        bail!("{place} cannot be a token; expected {}", settings::TOKEN_FORM);
+    }
+    Ok(found)
 }
 
 #[cfg(test)]
@@ -40,11 +54,30 @@ mod tests {
             ("", None),
         ] {
             fs::write(&path, text).expect("the file is written");
-            let found = read_password(&Password::File(path.clone()));
+            let found = read_secret("password", &Password::File(path.clone()));
             assert_eq!(found.ok().flatten().as_deref(), expected, "{text:?}");
         }
         fs::remove_file(&path).expect("the file is removed");
-        let error = read_password(&Password::File(path.clone())).expect_err("there is no file");
+        let error = read_secret("password", &Password::File(path.clone())).expect_err("there is no file");
         assert!(error.to_string().contains(&path.display().to_string()), "{error}");
+    }
+
+    #[test]
+    fn a_token_is_one_that_can_stand_in_a_header_and_is_not_repeated() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("token");
+        for (text, good) in [
+            ("s3cret-._~+/==\n", true),
+            ("se cret\n", false),
+            ("sécret", false),
+            ("a\nb\n", false),
+            ("==", false),
+        ] {
+            fs::write(&path, text).expect("the file is written");
+            match read_token(&Password::File(path.clone())) {
+                Ok(token) => assert!(good && token.as_deref() == Some(text.trim_end()), "{text:?}"),
+                Err(error) => assert!(!good && !error.to_string().contains(text.trim_end()), "{error}"),
+            }
+        }
     }
 }

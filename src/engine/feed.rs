@@ -22,10 +22,12 @@ pub struct News {
     pub data: Value,
 }
 
-/// The event `state`: all that the others are a difference to.
-pub fn everything(look: &Look) -> News {
+/// The event `state`: all that the others are a difference to. It may be told some time after the look:
+/// `now` is when.
+pub fn everything(look: &Look, now: Time) -> News {
     let Look { at, report } = look;
     let mut data = report.summary_json();
+    data["now"] = seconds(now - Time::default()).into();
     data["version"] = env!("CARGO_PKG_VERSION").into();
     data["buses"] = report.buses_json();
     data["devices"] = report.devices_json(*at);
@@ -208,7 +210,10 @@ mod tests {
             |look| look.report.buses[0].report.counters.timeouts = 1,
             &[("bus", "/bus/timeouts", json!(1)), both()],
         );
-        check(|look| device(look).online = false, &[("device", "/device/online", json!(false)), both()]);
+        check(
+            |look| device(look).online = false,
+            &[("gateway", "/status", json!("degraded")), ("device", "/device/online", json!(false)), both()],
+        );
     }
 
     #[test]
@@ -238,9 +243,9 @@ mod tests {
 
     #[test]
     fn everything_is_everything() {
-        let told = everything(&look(10));
+        let told = everything(&look(10), Time::from_millis(10_250));
         assert_eq!(told.event, "state");
-        assert_eq!(told.data["at"], 10.0);
+        assert_eq!((&told.data["at"], &told.data["now"]), (&json!(10.0), &json!(10.25)));
         assert_eq!(told.data["status"], "ok");
         assert_eq!(told.data["buses"][0]["name"], "cellar");
         assert_eq!(told.data["devices"][0]["points"][1]["value"], "18.0");

@@ -39,7 +39,7 @@ impl fmt::Debug for Mqtt {
     }
 }
 
-/// Where the broker's password comes from; the edge reads the file.
+/// Where the broker's password, or HTTP's token, comes from; the edge reads the file.
 #[derive(Clone, PartialEq, Eq)]
 pub enum Password {
     None,
@@ -56,10 +56,29 @@ pub struct HomeAssistant {
     pub status_topic: String,
 }
 
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, PartialEq, Eq)]
 pub struct Http {
     /// `host:port`; `None`: no HTTP.
     pub listen: Option<String>,
+    /// Who asks for anything but `/health` must know it.
+    pub token: Password,
+}
+
+impl fmt::Debug for Http {
+    /// Tells everything but the token.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Http({:?})", self.listen)
+    }
+}
+
+/// What a token is made of, for messages.
+pub const TOKEN_FORM: &str = "letters, digits and `-._~+/`, of which `openssl rand -hex 16` makes a good one";
+
+/// Whether it can stand behind `Authorization: Bearer` (RFC 6750, section 2.1).
+pub fn is_token(text: &str) -> bool {
+    let body = text.trim_end_matches('=');
+    let good = |byte: u8| byte.is_ascii_alphanumeric() || b"-._~+/".contains(&byte);
+    !body.is_empty() && body.bytes().all(good)
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

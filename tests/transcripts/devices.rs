@@ -51,7 +51,7 @@ pub fn settings(header: &str) -> Settings {
             prefix: "homeassistant".into(),
             status_topic: "homeassistant/status".into(),
         },
-        http: Http { listen: None },
+        http: Http { listen: None, token: Password::None },
         state_dir: "/nowhere".into(),
         republish: Duration::from_secs(600),
         on_broker_loss: if says("stop feeding") { OnBrokerLoss::StopFeeding } else { OnBrokerLoss::Keep },

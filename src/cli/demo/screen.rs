@@ -55,7 +55,7 @@ impl Screen {
             self.broker
         );
         if let Some(http) = http {
-            header.push_str(&format!("health  http://{http}/health\n"));
+            header.push_str(&format!("page    http://{http}/\nhealth  http://{http}/health\n"));
         }
         // Each command has a line of its own, to be copied as a whole.
         header.push_str(&format!(

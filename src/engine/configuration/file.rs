@@ -7,7 +7,7 @@ use std::marker::PhantomData;
 use serde_json::json;
 
 use crate::engine::configuration::words::{
-    BaudRate, BrokerUrl, HostPort, Listen, Name, NoTls, Part, StopBits, Topic, Unit,
+    BaudRate, BrokerUrl, HostPort, Listen, Name, NoTls, Part, StopBits, Token, Topic, Unit,
 };
 use crate::engine::device::Poll;
 use crate::engine::profile::file::{Intervals, Point, Presentation, Thing, Wire};
@@ -78,6 +78,11 @@ record! {
     pub struct Http {
         /// `host:port`; port 0 takes a free one, `null` turns HTTP off.
         listen: Option<Listen> = Some(Listen(HostPort { host: "127.0.0.1".into(), port: 8485 })),
+        /// What a reader must send as bearer token to see anything but `/health`. Better kept in a file of
+        /// its own, see `token_file`.
+        token: Option<At<Token>>,
+        /// A file whose first line is the token.
+        token_file: Option<At<String>>,
     }
 }
 

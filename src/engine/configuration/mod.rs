@@ -93,13 +93,14 @@ impl Resolver<'_> {
         self.within(file.republish.get(), Duration::from_secs(1), Duration::from_secs(86_400));
         let mqtt = section(&file.mqtt).map(|mqtt| self.mqtt(&mqtt));
         let eeprom = section(&file.eeprom).map(|eeprom| self.eeprom(&eeprom));
+        let http = section(&file.http).map(|http| self.http(&http));
         let buses = self.buses(file);
         let devices = self.devices(file);
         // Each `?` stands for a fault that has been noted.
         Some(Settings {
             mqtt: mqtt?,
             home_assistant: home_assistant(&section(&file.home_assistant)?),
-            http: http(&section(&file.http)?),
+            http: http?,
             state_dir: PathBuf::from(&file.state_dir.get()?.value),
             republish: file.republish.get()?.value,
             on_broker_loss: *file.on_broker_loss.get()?,
@@ -110,13 +111,8 @@ impl Resolver<'_> {
     }
 
     fn mqtt(&mut self, file: &file::Mqtt) -> Mqtt {
-        if let (Some(password), Some(password_file)) = (&file.password, &file.password_file) {
-            let line = password.place.line();
-            self.faults.add(
-                &password_file.place,
-                format!("`password` stands in line {line} too; keep one of the two"),
-            );
-        }
+        let (password, password_file) = (file.password.as_ref(), file.password_file.as_ref());
+        self.one_of_two("password", password.map(|at| &at.place), password_file.map(|at| &at.place));
         let secret = file.password.as_ref().or(file.password_file.as_ref());
         if let (Some(secret), None) = (secret, &file.username) {
             self.faults.add(&secret.place, "a password without `username`; a broker wants both or neither");
@@ -141,6 +137,29 @@ impl Resolver<'_> {
             self.faults.add(&file.daily.place, "no writes at all; expected at least 1 a day");
         }
         Eeprom { interval: file.interval.value, daily: file.daily.value.into() }
+    }
+
+    fn http(&mut self, file: &file::Http) -> Http {
+        let (token, token_file) = (file.token.as_ref(), file.token_file.as_ref());
+        self.one_of_two("token", token.map(|at| &at.place), token_file.map(|at| &at.place));
+        let listen = file.listen.as_ref().map(|Listen(listen)| match listen.host.contains(':') {
+            true => format!("[{}]:{}", listen.host, listen.port),
+            false => format!("{}:{}", listen.host, listen.port),
+        });
+        let token = match (token, token_file) {
+            (Some(token), _) => Password::Given(token.0.clone()),
+            (None, Some(path)) => Password::File(PathBuf::from(&path.value)),
+            (None, None) => Password::None,
+        };
+        Http { listen, token }
+    }
+
+    /// A secret stands in the configuration or in a file of its own.
+    fn one_of_two(&mut self, key: &str, here: Option<&Place>, in_a_file: Option<&Place>) {
+        if let (Some(here), Some(in_a_file)) = (here, in_a_file) {
+            let line = here.line();
+            self.faults.add(in_a_file, format!("`{key}` stands in line {line} too; keep one of the two"));
+        }
     }
 
     fn buses(&mut self, file: &Configuration) -> Vec<Bus> {
@@ -440,14 +459,6 @@ fn home_assistant(file: &file::HomeAssistant) -> HomeAssistant {
         prefix: file.prefix.0.clone(),
         status_topic: file.status_topic.0.clone(),
     }
-}
-
-fn http(file: &file::Http) -> Http {
-    let listen = file.listen.as_ref().map(|Listen(listen)| match listen.host.contains(':') {
-        true => format!("[{}]:{}", listen.host, listen.port),
-        false => format!("{}:{}", listen.host, listen.port),
-    });
-    Http { listen }
 }
 
 /// A section that was left out is one in which every key was left out; `None` for a faulty one.

@@ -1,4 +1,4 @@
-//! A configuration's text without its passwords, for the lines that messages show.
+//! A configuration's text without its passwords and tokens, for the lines that messages show.
 
 /// `text` with a `*` for each byte of a password, so that every place stays where it is. Works on the
 /// text and not on what it means: a password may be the very thing that makes it unreadable.
@@ -8,8 +8,8 @@ pub fn hidden(text: &str) -> String {
 
 fn hidden_in_line(line: &str) -> String {
     let mut hidden = line.as_bytes().to_vec();
-    // `password: …`, also misspelt, but not `password_file: …`.
-    for (at, _) in line.match_indices("pas") {
+    // `password: …` and `token: …`, also misspelt, but not `password_file: …`.
+    for (at, _) in line.match_indices("pas").chain(line.match_indices("tok")) {
         let word_end =
             line[at..].find(|c: char| !c.is_ascii_alphanumeric()).map_or(line.len(), |end| at + end);
         let after = line[word_end..].trim_start_matches(['"', '\'', ' ']);
@@ -46,6 +46,9 @@ mod tests {
             // A star for each byte, of which the é has two.
             ("  pasword: gehéim\n", "  pasword: *******\n"),
             ("  password_file: /etc/x\n", "  password_file: /etc/x\n"),
+            ("http: {token: abc, listen: 'h:1'}\n", "http: {token: **** ******* *****\n"),
+            ("  tokken: abc\n", "  tokken: ***\n"),
+            ("  token_file: /etc/x\n", "  token_file: /etc/x\n"),
             ("url: mqtt://joe:p@ss@host:1\n", "url: mqtt://********@host:1\n"),
             ("url: joe:pw@host\n", "url: ******@host\n"),
             ("url: mqtt://host:1\n", "url: mqtt://host:1\n"),

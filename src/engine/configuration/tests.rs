@@ -88,7 +88,7 @@ fn every_key_has_its_place() {
         "
 mqtt: {url: 'mqtt://[fe80::1]:1884', username: busker, password_file: /p, base_topic: house/busker}
 home_assistant: {discovery: false, prefix: ha, status_topic: ha/up}
-http: {listen: 'localhost:0'}
+http: {listen: 'localhost:0', token: s3cret}
 state_dir: /tmp/state
 republish: 1h
 on_broker_loss: stop_feeding
@@ -108,6 +108,8 @@ devices:
         HomeAssistant { discovery: false, prefix: "ha".into(), status_topic: "ha/up".into() }
     );
     assert_eq!(settings.http.listen.as_deref(), Some("localhost:0"));
+    assert!(settings.http.token == Password::Given("s3cret".into()));
+    assert!(!format!("{settings:?}").contains("s3cret"));
     assert_eq!(settings.on_broker_loss, OnBrokerLoss::StopFeeding);
     assert_eq!(settings.republish, Duration::from_secs(3600));
     let line = Line { baud: 9600, parity: Parity::Odd, stop_bits: 2 };
@@ -140,7 +142,9 @@ fn what_is_left_out_has_the_documented_default() {
     assert_eq!(settings.state_dir, PathBuf::from("/var/lib/busker"));
     assert_eq!(settings.republish, Duration::from_secs(600));
     assert_eq!(settings.on_broker_loss, OnBrokerLoss::Keep);
-    assert_eq!(good("buses: {}\nhttp: {listen: null}\n").0.http.listen, None);
+    assert!(settings.http.token == Password::None);
+    let http = good("buses: {}\nhttp: {listen: null, token_file: /t}\n").0.http;
+    assert!(http.listen.is_none() && http.token == Password::File("/t".into()));
 }
 
 #[test]

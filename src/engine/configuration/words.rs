@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::engine::settings::{OnBrokerLoss, Parity};
+use crate::engine::settings::{self, OnBrokerLoss, Parity};
 use crate::engine::yaml::{Definitions, Faults, Json, Node, Read, Scalar, choices};
 
 choices! { "a parity", Parity { "none" => Parity::None, "even" => Parity::Even, "odd" => Parity::Odd } }
@@ -158,6 +158,33 @@ impl Scalar for Listen {
 
     fn schema() -> Json {
         <HostPort as Scalar>::schema()
+    }
+}
+
+/// What stands behind `Authorization: Bearer`.
+#[derive(Clone)]
+pub struct Token(pub String);
+
+impl std::fmt::Debug for Token {
+    /// It is a secret.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Token(…)")
+    }
+}
+
+impl Scalar for Token {
+    const EXPECTED: &'static str = "a token of letters and digits";
+
+    fn parse(text: &str) -> Result<Token, String> {
+        // No message repeats it.
+        match settings::is_token(text) {
+            true => Ok(Token(text.into())),
+            false => Err(format!("this cannot be a token; expected {}", settings::TOKEN_FORM)),
+        }
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": "^[A-Za-z0-9._~+/-]+=*$"})
     }
 }
 

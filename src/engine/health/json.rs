@@ -164,6 +164,7 @@ pub fn point_json(point: &PointReport, now: Time, is_heard: bool) -> Value {
         "missing": missing,
         "reason": reason,
         "read_seconds_ago": point.read_at.map(|at| seconds(now - at)),
+        "good_for_seconds": point.good_for.map(seconds),
     });
     if point.is_list {
         // The text of a list of numbers is JSON.

@@ -1,14 +1,20 @@
 //! The HTTP door: tells how the gateway is, and takes no orders.
 
+mod door;
+mod events;
+mod page;
+mod patience;
+
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use anyhow::Context;
+use axum::body::Body;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use axum::{Json, Router};
+use axum::{Json, Router, middleware};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
@@ -16,6 +22,9 @@ use crate::edge::clock::Clock;
 use crate::edge::metrics;
 use crate::edge::reports::Reporter;
 use crate::engine::health::Status;
+use door::Door;
+use events::Hub;
+use patience::PatientListener;
 
 /// An address that is taken, but not yet answered on.
 pub struct Bound {
@@ -26,7 +35,7 @@ pub struct Bound {
 /// The running server.
 pub struct Http {
     address: SocketAddr,
-    server: JoinHandle<()>,
+    tasks: [JoinHandle<()>; 2],
 }
 
 impl Http {
@@ -38,20 +47,26 @@ impl Http {
         Ok(Bound { listener, address })
     }
 
-    /// Answers from now on. Only within a runtime.
-    pub fn serve(bound: Bound, reporter: Arc<Reporter>, clock: Clock) -> Http {
+    /// Answers from now on, to everything but `/health` only those who know the token. Only within a
+    /// runtime.
+    pub fn serve(bound: Bound, reporter: Arc<Reporter>, clock: Clock, token: Option<String>) -> Http {
+        let hub = Arc::new(Hub::default());
+        let telling = tokio::spawn(events::tell(hub.clone(), reporter.clone(), clock));
         let router = Router::new()
+            .route("/", get(page::page))
             .route("/health", get(health))
             .route("/metrics", get(metrics))
             .route("/api/devices", get(devices))
             .route("/api/buses", get(buses))
-            .with_state(Shared { reporter, clock });
+            .route("/api/events", get(events))
+            .with_state(Shared { reporter, clock, hub })
+            .layer(middleware::from_fn_with_state(Arc::new(Door::new(token)), door::pass));
         let server = tokio::spawn(async move {
-            if let Err(error) = axum::serve(bound.listener, router).await {
+            if let Err(error) = axum::serve(PatientListener::new(bound.listener), router).await {
                 tracing::warn!("the HTTP server has ended: {error}");
             }
         });
-        Http { address: bound.address, server }
+        Http { address: bound.address, tasks: [server, telling] }
     }
 
     pub fn address(&self) -> SocketAddr {
@@ -59,7 +74,7 @@ impl Http {
     }
 
     pub fn stop(self) {
-        self.server.abort();
+        self.tasks.iter().for_each(JoinHandle::abort);
     }
 }
 
@@ -67,6 +82,7 @@ impl Http {
 struct Shared {
     reporter: Arc<Reporter>,
     clock: Clock,
+    hub: Arc<Hub>,
 }
 
 async fn health(State(shared): State<Shared>) -> Response {
@@ -86,9 +102,21 @@ async fn metrics(State(shared): State<Shared>) -> Response {
 }
 
 async fn devices(State(shared): State<Shared>) -> Response {
-    Json(shared.reporter.report().await.devices_json(shared.clock.now())).into_response()
+    let report = shared.reporter.report().await;
+    // After the answer: what a stuck bus said last has grown older while we waited for it.
+    Json(report.devices_json(shared.clock.now())).into_response()
 }
 
 async fn buses(State(shared): State<Shared>) -> Response {
     Json(shared.reporter.report().await.buses_json()).into_response()
+}
+
+async fn events(State(shared): State<Shared>) -> Response {
+    let Some(stream) = shared.hub.join() else {
+        return (StatusCode::SERVICE_UNAVAILABLE, "too many are watching already\n").into_response();
+    };
+    // A proxy in between that collects what it passes on would keep the news back.
+    let headers =
+        [(header::CONTENT_TYPE, "text/event-stream"), (HeaderName::from_static("x-accel-buffering"), "no")];
+    (headers, Body::new(stream)).into_response()
 }
