@@ -2,7 +2,7 @@
 
 mod json;
 
-pub use json::{device_json, info_json, point_json, seconds};
+pub use json::{device_json, drift_json, info_json, point_json, seconds};
 
 use crate::engine::device::{Category, Point, Poll};
 use crate::engine::modbus::{Discarded, RequestError};
@@ -109,6 +109,18 @@ pub struct DeviceReport {
     pub periods: Vec<PeriodReport>,
     pub points: Vec<PointReport>,
     pub things: Vec<ThingReport>,
+    /// Settings that are not what the configuration wants.
+    pub drift: Vec<Drift>,
+}
+
+/// A setting that does not hold what is wanted.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Drift {
+    pub point: String,
+    pub wanted: String,
+    pub found: Option<String>,
+    /// What keeps it so, where it is known.
+    pub reason: Option<String>,
 }
 
 /// How often a device is read: as it was asked for, and as it is.

@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use crate::engine::codec;
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::device::{Device, PointIndex};
+use crate::engine::health::Drift;
 use crate::engine::memory::Memory;
 use crate::engine::settings::Wanted;
 use crate::engine::state::Values;
@@ -89,16 +90,6 @@ pub enum Standing {
         found: Option<String>,
         reason: String,
     },
-}
-
-/// A setting that does not hold what is wanted.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Drift {
-    pub point: String,
-    pub wanted: String,
-    pub found: Option<String>,
-    /// What keeps it so, where it is known.
-    pub reason: Option<String>,
 }
 
 /// Something for the log.

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use serde_json::{Map, Value, json};
 
-use super::{BusHealth, Counters, DeviceReport, GatewayReport, PointReport, ThingReport};
+use super::{BusHealth, Counters, DeviceReport, Drift, GatewayReport, PointReport, ThingReport};
 use crate::engine::settings::Settings;
 use crate::engine::time::{Duration, Time};
 
@@ -144,7 +144,21 @@ pub fn device_json(bus: &BusHealth, device: &DeviceReport, now: Time) -> Value {
         "periods": periods,
         "counters": counters_json(&device.counters),
         "things": things,
+        "drift": drift_json(&device.drift),
     })
+}
+
+/// As it stands in a device's info, too.
+pub fn drift_json(drift: &[Drift]) -> Value {
+    let told = |drift: &Drift| {
+        json!({
+            "point": drift.point,
+            "wanted": drift.wanted,
+            "found": drift.found,
+            "reason": drift.reason,
+        })
+    };
+    drift.iter().map(told).collect()
 }
 
 fn counters_json(counters: &Counters) -> Map<String, Value> {

@@ -34,6 +34,7 @@ impl DeviceState {
             periods: self.report_periods(now),
             points: points.map(|(index, point)| self.report_point(index, point)).collect(),
             things: things.map(|thing| self.report_thing(thing)).collect(),
+            drift: self.upkeep.drift(),
         }
     }
 

@@ -5,6 +5,7 @@ use serde_json::json;
 
 use crate::engine::codec;
 use crate::engine::device::{PointIndex, Thing};
+use crate::engine::health::drift_json;
 use crate::engine::homeassistant;
 use crate::engine::time::Time;
 use crate::engine::topics::{Message, OFFLINE, ONLINE};
@@ -136,19 +137,6 @@ impl DeviceState {
                 _ => None,
             })
             .collect();
-        let drift: Vec<serde_json::Value> = self
-            .upkeep
-            .drift()
-            .into_iter()
-            .map(|drift| {
-                json!({
-                    "point": drift.point,
-                    "wanted": drift.wanted,
-                    "found": drift.found,
-                    "reason": drift.reason,
-                })
-            })
-            .collect();
         let info = json!({
             "profile": self.settings.device.profile,
             "manufacturer": self.settings.device.manufacturer,
@@ -160,7 +148,7 @@ impl DeviceState {
             "reason": self.reason(),
             "missing": missing,
             "eeprom_writes": self.counters.persistent_writes,
-            "drift": drift,
+            "drift": drift_json(&self.upkeep.drift()),
         })
         .to_string();
         self.told_present = self.presence == Presence::Present;
