@@ -130,7 +130,7 @@ mod tests {
             title: "Blind".into(),
             kind: "cover",
             state: Some("open".into()),
-            reason: None,
+            missing: None,
             made_of: vec!["flow".into()],
             temperature: None,
             target: None,

@@ -237,8 +237,8 @@ pub struct ThingReport {
     /// `cover`, `climate`
     pub kind: &'static str,
     pub state: Option<String>,
-    /// Why there is no state.
-    pub reason: Option<String>,
+    /// Why there is no state: a word for programs and a text for people.
+    pub missing: Option<(&'static str, String)>,
     /// The names of the points that its state is made of.
     pub made_of: Vec<String>,
     /// The names of a climate's points with the present and the wanted temperature.
@@ -441,7 +441,7 @@ mod tests {
             title: "Blind".into(),
             kind: "cover",
             state: state.map(str::to_string),
-            reason: None,
+            missing: None,
             made_of: made_of.iter().map(|name| name.to_string()).collect(),
             temperature: None,
             target: None,

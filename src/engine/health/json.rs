@@ -167,7 +167,7 @@ fn counters_json(counters: &Counters) -> Map<String, Value> {
 
 /// One point; `is_heard` as in [`PointReport::freshness`].
 pub fn point_json(point: &PointReport, now: Time, is_heard: bool) -> Value {
-    let (missing, reason) = point.missing.as_ref().map(|(word, text)| (*word, text.as_str())).unzip();
+    let (missing, reason) = told_missing(&point.missing);
     let mut value = json!({
         "name": point.name,
         "title": point.title,
@@ -188,16 +188,22 @@ pub fn point_json(point: &PointReport, now: Time, is_heard: bool) -> Value {
 }
 
 fn thing_json(thing: &ThingReport, device: &DeviceReport, now: Time, is_heard: bool) -> Value {
+    let (missing, reason) = told_missing(&thing.missing);
     json!({
         "name": thing.name,
         "title": thing.title,
         "kind": thing.kind,
         "state": thing.state,
         "freshness": thing.freshness(device, now, is_heard).name(),
-        "reason": thing.reason,
+        "missing": missing,
+        "reason": reason,
         "temperature": thing.temperature,
         "target": thing.target,
     })
+}
+
+fn told_missing(missing: &Option<(&'static str, String)>) -> (Option<&'static str>, Option<&str>) {
+    missing.as_ref().map(|(word, text)| (*word, text.as_str())).unzip()
 }
 
 /// With the digits that mean something.

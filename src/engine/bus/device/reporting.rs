@@ -68,7 +68,7 @@ impl DeviceState {
             return match self.happened.get(&index) {
                 Some(at) => PointReport { value: event.clone(), read_at: Some(*at), ..told },
                 None => {
-                    let missing = ("no_event", "has not happened since the start".into());
+                    let missing = ("no_event", "not since the start".into());
                     PointReport { missing: Some(missing), ..told }
                 }
             };
@@ -103,12 +103,13 @@ impl DeviceState {
 
     fn report_thing(&self, thing: &Thing) -> ThingReport {
         let state = self.state_of(thing).map(str::to_string);
-        let reason = match codec::lives(self.device(), &thing.when, self.known()) {
+        let why = |missing: Missing| Some((missing.name(), missing.to_string()));
+        let missing = match codec::lives(self.device(), &thing.when, self.known()) {
             _ if state.is_some() => None,
-            _ if self.presence != Presence::Present => Some(Missing::Offline.to_string()),
-            Ok(false) => Some(Missing::NotInThisMode.to_string()),
-            Err(missing) => Some(missing.to_string()),
-            Ok(true) => Some("what its points say is none of its states".into()),
+            _ if self.presence != Presence::Present => why(Missing::Offline),
+            Ok(false) => why(Missing::NotInThisMode),
+            Err(missing) => why(missing),
+            Ok(true) => Some(("no_state", "what its points say is none of its states".into())),
         };
         let name_of = |point: PointIndex| self.details(point).name.clone();
         let mut made_of: Vec<String> =
@@ -119,7 +120,7 @@ impl DeviceState {
             title: thing.presentation.name.clone().unwrap_or_else(|| sentence(&thing.name)),
             kind: thing.kind.name(),
             state,
-            reason,
+            missing,
             made_of,
             temperature: thing.temperature.map(name_of),
             target: thing.target.map(name_of),
