@@ -3,7 +3,7 @@
 # Appended to PATH, so that nobody's own programs are hidden.
 WITH_MOSQUITTO = tools=$$(scripts/get-mosquitto) && PATH="$$PATH:$$tools"
 
-.PHONY: demo test test-home-assistant lint goldens
+.PHONY: demo test test-page test-home-assistant lint goldens
 
 # The whole program without hardware: simulated devices, a broker, the gateway. Ctrl-C ends it.
 demo:
@@ -13,6 +13,10 @@ demo:
 # what only tests need), so that the test of `make demo` waits for the demo and not for the compiler.
 test:
 	@$(WITH_MOSQUITTO) cargo build --locked && exec cargo test --locked
+
+# The status page in a real Chromium, which is installed where it is missing. Pictures go to target/page.
+test-page:
+	@$(WITH_MOSQUITTO) && exec tests/page/run
 
 # The discovery messages against a real Home Assistant core; downloads about 800 MB the first time.
 test-home-assistant:

@@ -5,6 +5,7 @@ import json
 import os
 import queue
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -26,9 +27,14 @@ class Browser:
         if os.getuid() == 0:
             # Chromium's sandbox does not work for root, and the page is ours.
             options.append("--no-sandbox")
-        # The browser reads orders from 3 and answers on 4.
+        # The browser reads orders from 3 and answers on 4. First out of the way of each other.
+        become = (
+            "import os, sys; ends = [os.dup(int(end)) for end in sys.argv[1:3]];"
+            " [os.dup2(end, 100 + number) for number, end in enumerate(ends)];"
+            " os.dup2(100, 3); os.dup2(101, 4); os.execvp(sys.argv[3], sys.argv[3:])"
+        )
         self.process = subprocess.Popen(
-            ["sh", "-c", f'exec "$@" 3<&{orders_in} 4>&{answers_out}', "sh", program, *options, "about:blank"],
+            [sys.executable, "-c", become, str(orders_in), str(answers_out), program, *options, "about:blank"],
             pass_fds=(orders_in, answers_out), stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )
@@ -99,12 +105,16 @@ class Browser:
         """Until the expression is true; returns its value."""
         end = time.monotonic() + PATIENCE
         while True:
-            value = self.evaluate(expression)
+            try:
+                value = self.evaluate(expression)
+            except RuntimeError:
+                # What it speaks of is not there yet.
+                value = None
             if value:
                 return value
             if time.monotonic() > end:
                 text = self.evaluate("document.body.innerText")
-                raise AssertionError(f"{what}: `{expression}` does not come true. The page says:\n{text}")
+                raise AssertionError(f"{what}: `{expression}` does not come true. The page says:\n{text}\n{self.complaints}")
             time.sleep(0.05)
 
     def press(self, key, code, text=""):

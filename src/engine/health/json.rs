@@ -202,7 +202,7 @@ fn thing_json(thing: &ThingReport, device: &DeviceReport, now: Time, is_heard: b
     })
 }
 
-fn told_missing(missing: &Option<(&'static str, String)>) -> (Option<&'static str>, Option<&str>) {
+fn told_missing<'m>(missing: &'m Option<(&'static str, String)>) -> (Option<&'static str>, Option<&'m str>) {
     missing.as_ref().map(|(word, text)| (*word, text.as_str())).unzip()
 }
 
