@@ -98,7 +98,7 @@ def row(device, name):
     return (
         f"(() => {{ const row = [...document.querySelectorAll('#device-{device} tr')]"
         f".find((row) => row.cells[0].textContent === {title});"
-        " return row && `${row.className}: ${row.cells[1].innerText.trim().replace(/\\s+/g, ' ')}`; })()"
+        " return row && `${row.className}: ${row.cells[1].textContent.trim().replace(/\\s+/g, ' ')}`; })()"
     )
 
 
@@ -223,7 +223,12 @@ def main(stack):
     ]:
         page.size(*size)
         page.scheme(scheme)
-        page.wait(f"innerWidth === {size[0]} && document.documentElement.scrollWidth <= innerWidth", f"{name} fits")
+        wide = page.evaluate(
+            "[...document.querySelectorAll('body *')].filter((place) => !place.closest('.unseen, svg')"
+            f" && place.getBoundingClientRect().right > {size[0]} + 0.5)"
+            ".map((place) => `${place.tagName} ${place.className} ${place.textContent.slice(0, 40)}`)"
+        )
+        assert wide == [], (name, wide)
         page.screenshot(FOLDER / f"{name}.png")
         page.screenshot(FOLDER / f"{name}-whole.png", whole=True)
     page.size(1440, 1000)
