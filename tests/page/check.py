@@ -229,6 +229,8 @@ def main(stack):
             ".map((place) => `${place.tagName} ${place.className} ${place.textContent.slice(0, 40)}`)"
         )
         assert wide == [], (name, wide)
+        widths = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        assert widths == [size[0], size[0]], (name, widths)
         page.screenshot(FOLDER / f"{name}.png")
         page.screenshot(FOLDER / f"{name}-whole.png", whole=True)
     page.size(1440, 1000)
@@ -244,6 +246,8 @@ def main(stack):
     page.wait("document.body.classList.contains('lost') && !document.querySelector('#lost').hidden", "the loss is told")
     page.wait("![...document.querySelectorAll('tr.fresh')].length", "nothing is fresh any more")
     assert page.evaluate("document.querySelector('#status .dot').className") == "dot unknown"
+    buses = page.evaluate("[...document.querySelectorAll('.bus')].map((bus) => bus.innerText)")
+    assert all("— requests/s" in bus and "— load" in bus for bus in buses), buses
     page.screenshot(FOLDER / "lost.png")
     print(f"the page is as it should be; pictures of it are in {FOLDER}")
 
