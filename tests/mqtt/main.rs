@@ -1,6 +1,7 @@
 //! The whole program between simulated devices and a real broker.
 
 mod rig;
+mod watching;
 
 use std::collections::BTreeSet;
 use std::fs;

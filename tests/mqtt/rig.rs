@@ -164,6 +164,11 @@ impl Gateway {
         lock(&self.log.0).clone()
     }
 
+    /// `http://127.0.0.1:…`
+    pub fn http(&self) -> &str {
+        &self.http
+    }
+
     /// Status and body of a page.
     pub fn get(&self, path: &str) -> (u16, String) {
         let agent: ureq::Agent = ureq::Agent::config_builder()
