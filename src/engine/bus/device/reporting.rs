@@ -132,3 +132,99 @@ impl DeviceState {
         codec::resolve(self.device(), point, self.known()).ok().and_then(|resolved| resolved.unit)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::bus::{Action, Bus, Event};
+    use crate::engine::configuration;
+    use crate::engine::health::{BusReport, Freshness};
+    use crate::engine::modbus::{Discarded, Reply, RequestError};
+    use crate::engine::profile::Library;
+    use crate::engine::settings::Settings;
+
+    /// A meter with arrays, a damper with events and things, on one bus.
+    fn settings() -> Settings {
+        let text = "buses: {b: {rtu_over_tcp: 'h:1'}}\ndevices:\n  \
+            meter: {profile: metz-connect/mr-sm3, bus: b, unit: 1}\n  \
+            damper: {profile: metz-connect/mr-dio42, bus: b, unit: 2}\n";
+        match configuration::load("f", text.as_bytes(), &Library::shipped()) {
+            Ok((settings, _)) => settings,
+            Err(faults) => panic!("{faults:?}"),
+        }
+    }
+
+    fn bus() -> Bus {
+        Bus::new(Time::default(), &settings(), 0, &Default::default())
+    }
+
+    fn point<'r>(report: &'r BusReport, device: usize, name: &str) -> &'r PointReport {
+        report.devices[device].points.iter().find(|point| point.name == name).expect("a point of it")
+    }
+
+    #[test]
+    fn of_what_nobody_has_asked_nothing_is_known_and_everything_has_its_reason() {
+        let now = Time::from_millis(5000);
+        let report = bus().report(now);
+        assert_eq!(report.line.as_deref(), Some("19200 8E1"));
+        for device in &report.devices {
+            assert!(!device.online && device.last_answer_at.is_none());
+            assert!(device.periods.iter().all(|period| period.real.is_none()), "{:?}", device.periods);
+            for point in &device.points {
+                assert_eq!(point.freshness(now, true), Freshness::Missing, "{point:?}");
+                assert_eq!(point.read_at, None, "{point:?}");
+            }
+            for thing in &device.things {
+                assert!(thing.state.is_none() && thing.missing.is_some(), "{thing:?}");
+            }
+        }
+        for (device, name, role, missing) in [
+            (0, "phase_1_voltage", Role::Value, "not_yet_read"),
+            (0, "phase_1_waveform", Role::Value, "on_request"),
+            (0, "phase_1_voltage_factor", Role::Setting, "not_yet_read"),
+            (0, "phase_1_peak_voltage", Role::Diagnostic, "not_yet_read"),
+            (1, "input_1_opened", Role::Event, "no_event"),
+        ] {
+            let told = point(&report, device, name);
+            assert_eq!((told.role, told.missing.as_ref().map(|why| why.0)), (role, Some(missing)), "{name}");
+        }
+        assert_eq!(report.devices[1].things.iter().filter(|thing| thing.kind == "button").count(), 0);
+        assert!(!report.devices[1].things.is_empty());
+    }
+
+    #[test]
+    fn a_silent_device_tells_why_and_not_that_it_keeps_a_period() {
+        let (mut bus, mut now) = (bus(), Time::default());
+        bus.handle(now, Event::LinkUp);
+        for _ in 0..40 {
+            while let Some(action) = bus.next_action() {
+                if let Action::Send { timeout, .. } = action {
+                    let sent_at = now;
+                    now += timeout;
+                    let reply = Reply {
+                        result: Err(RequestError::Timeout),
+                        sent_at,
+                        first_byte_at: None,
+                        last_byte_at: None,
+                        discarded: Discarded::default(),
+                    };
+                    bus.handle(now, Event::Reply(reply));
+                }
+            }
+            now += Duration::from_secs(1);
+            bus.handle(now, Event::Wake);
+        }
+        let report = bus.report(now);
+        for device in &report.devices {
+            assert!(device.counters.timeouts >= 3, "{:?}", device.counters);
+            assert_eq!(device.reason.as_deref(), Some("no answer in time, 3 times in a row"));
+            assert!(device.periods.iter().all(|period| period.real.is_none()));
+            let events = device.points.iter().filter(|point| point.role == Role::Event);
+            assert!(
+                events.clone().all(|point| point.missing.as_ref().is_some_and(|why| why.0 == "no_event"))
+            );
+            let others = device.points.iter().filter(|point| point.role != Role::Event);
+            assert!(others.clone().all(|point| point.missing.as_ref().is_some_and(|why| why.0 == "offline")));
+        }
+    }
+}
