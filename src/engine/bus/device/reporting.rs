@@ -195,20 +195,21 @@ mod tests {
     #[test]
     fn a_silent_device_tells_why_and_not_that_it_keeps_a_period() {
         let (mut bus, mut now) = (bus(), Time::default());
-        bus.handle(now, Event::LinkUp);
         for _ in 0..40 {
             while let Some(action) = bus.next_action() {
-                if let Action::Send { timeout, .. } = action {
-                    let sent_at = now;
-                    now += timeout;
-                    let reply = Reply {
-                        result: Err(RequestError::Timeout),
-                        sent_at,
-                        first_byte_at: None,
-                        last_byte_at: None,
-                        discarded: Discarded::default(),
-                    };
-                    bus.handle(now, Event::Reply(reply));
+                match action {
+                    // A connection that is made anew.
+                    Action::Reopen { .. } => bus.handle(now, Event::LinkUp),
+                    Action::Send { timeout, .. } => {
+                        let sent_at = now;
+                        now += timeout;
+                        let result = Err(RequestError::Timeout);
+                        let discarded = Discarded::default();
+                        let reply =
+                            Reply { result, sent_at, first_byte_at: None, last_byte_at: None, discarded };
+                        bus.handle(now, Event::Reply(reply));
+                    }
+                    _ => {}
                 }
             }
             now += Duration::from_secs(1);
