@@ -46,7 +46,7 @@ mod tests {
             // A star for each byte, of which the é has two.
             ("  pasword: gehéim\n", "  pasword: *******\n"),
             ("  password_file: /etc/x\n", "  password_file: /etc/x\n"),
-            ("http: {token: abc, listen: 'h:1'}\n", "http: {token: **** ******* *****\n"),
+            ("http: {token: abc, listen: 'h:1'}\n", "http: {token: **** ******* ******\n"),
             ("  tokken: abc\n", "  tokken: ***\n"),
             ("  token_file: /etc/x\n", "  token_file: /etc/x\n"),
             ("url: mqtt://joe:p@ss@host:1\n", "url: mqtt://********@host:1\n"),
