@@ -57,7 +57,9 @@ impl Announcement {
             head.insert("availability".into(), topics.into());
             head.insert("availability_mode".into(), "all".into());
         }
-        head.insert("qos".into(), 1.into());
+        // No `qos`: with 1, Home Assistant keeps a command that is given while the broker is away, and
+        // sends it when the broker is back, however long that takes. With 0 it tells its user that
+        // the command failed. States are retained, and come with 0 as well.
         Announcement { topic: topics::discovery(&gateway.prefix, identity), head, components }
     }
 
@@ -288,7 +290,6 @@ mod tests {
             "origin": {"name": "busker", "sw_version": env!("CARGO_PKG_VERSION")},
             "availability": [{"topic": "busker/bridge/state"}, {"topic": "busker/heating/availability"}],
             "availability_mode": "all",
-            "qos": 1,
             "components": {
                 "relay": {
                     "platform": "switch",
