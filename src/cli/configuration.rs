@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 
 use super::Failure;
+use crate::edge::{files, tls};
 use crate::engine::configuration::{self, Warning};
 use crate::engine::profile::Library;
 use crate::engine::settings::{Password, Settings};
@@ -23,11 +24,15 @@ pub struct ConfigurationArgs {
 impl ConfigurationArgs {
     /// The settings; warnings are told on standard error.
     pub fn load(&self) -> Result<Settings, Failure> {
+        load(&self.config)?.map(Loaded::settings_with_warnings).map_err(faults)
+    }
+
+    /// The same for a verb that talks to the broker: the files of the broker's section are there.
+    pub fn load_with_broker(&self) -> Result<Settings, Failure> {
         let loaded = load(&self.config)?.map_err(faults)?;
-        for warning in &loaded.warnings {
-            eprintln!("warning: {}: {}", warning.place, warning.message);
-        }
-        Ok(loaded.settings)
+        let mut found = loaded.tls_faults();
+        found.extend(loaded.secret_faults());
+        if found.is_empty() { Ok(loaded.settings_with_warnings()) } else { Err(faults(found)) }
     }
 }
 
@@ -37,6 +42,45 @@ pub struct Loaded {
     pub warnings: Vec<Warning>,
     /// The shipped profiles, and over them those of the folders that the configuration names.
     pub library: Library,
+    /// What the file is called, and what is in it.
+    file: (String, Vec<u8>),
+}
+
+impl Loaded {
+    /// What is wrong with the files of TLS, which shall not wait for the start.
+    pub fn tls_faults(&self) -> Vec<Diagnostic> {
+        let faults = self.settings.mqtt.tls.as_ref().and_then(|tls| tls::client_config(tls).err());
+        let place = |fault: tls::Fault| match fault.key {
+            Some(key) => self.at(&["mqtt", "tls", key], fault.message),
+            None => self.at(&["mqtt", "url"], fault.message),
+        };
+        faults.into_iter().flatten().map(place).collect()
+    }
+
+    /// Why the gateway could not read its secrets. Whoever checks a configuration may have no right to.
+    pub fn secret_faults(&self) -> Vec<Diagnostic> {
+        let Settings { mqtt, http, .. } = &self.settings;
+        let mut found = Vec::new();
+        if let Err(error) = files::read_secret("password", &mqtt.password) {
+            found.push(self.at(&["mqtt", "password_file"], format!("{error:#}")));
+        }
+        if let Err(error) = files::read_token(&http.token) {
+            found.push(self.at(&["http", "token_file"], format!("{error:#}")));
+        }
+        found
+    }
+
+    fn at(&self, keys: &[&str], message: String) -> Diagnostic {
+        let (name, bytes) = &self.file;
+        configuration::fault_at(name, bytes, keys, message)
+    }
+
+    fn settings_with_warnings(self) -> Settings {
+        for warning in &self.warnings {
+            eprintln!("warning: {}: {}", warning.place, warning.message);
+        }
+        self.settings
+    }
 }
 
 /// Reads the file and the profiles. A file that cannot be read at all is a [`Failure`]; what is wrong
@@ -58,13 +102,14 @@ pub fn load(path: &Path) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
     }
     match configuration::load(&shown, &bytes, &library) {
         Ok((mut settings, warnings)) if unreadable.is_empty() => {
+            settings.resolve_files(path.parent().unwrap_or(Path::new("")));
             let secret = |configured, variable, credential| {
                 let folder = env::var_os("CREDENTIALS_DIRECTORY").map(PathBuf::from);
                 nearest(configured, env::var(variable).ok(), folder.map(|folder| folder.join(credential)))
             };
             settings.mqtt.password = secret(settings.mqtt.password, "BUSKER_MQTT_PASSWORD", "mqtt-password");
             settings.http.token = secret(settings.http.token, "BUSKER_HTTP_TOKEN", "http-token");
-            Ok(Ok(Loaded { settings, warnings, library }))
+            Ok(Ok(Loaded { settings, warnings, library, file: (shown, bytes) }))
         }
         Ok(_) => Ok(Err(unreadable)),
         Err(faults) => Ok(Err([unreadable, faults].concat())),

@@ -22,7 +22,8 @@ pub struct Args {
 
 pub fn run(args: Args) -> Result<(), Failure> {
     log::start();
-    let mut settings = args.configuration.load().map_err(|failure| failure.so("nothing was started"))?;
+    let mut settings =
+        args.configuration.load_with_broker().map_err(|failure| failure.so("nothing was started"))?;
     if args.http.is_some() {
         settings.http.listen = args.http;
     }

@@ -15,6 +15,7 @@ use crate::edge::files;
 use crate::edge::http::Http;
 use crate::edge::mqtt::{Broker, Mailbox, News};
 use crate::edge::reports::{Ask, Reporter};
+use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Signals};
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Bus, Command, Event};
@@ -49,7 +50,7 @@ impl App {
     /// Starts everything, going on from what is remembered in `state`. An error means that nothing is left
     /// running.
     pub fn start(settings: Settings, state: StateFiles) -> anyhow::Result<App> {
-        let password = files::read_secret("password", &settings.mqtt.password)?;
+        let secrets = Secrets::read(&settings.mqtt)?;
         let token = files::read_token(&settings.http.token)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
@@ -74,7 +75,7 @@ impl App {
 
         let _inside = runtime.enter();
         let route = Route::new(&settings, topics.clone(), buses.clone(), mailbox.clone());
-        let broker = Broker::start(&settings, password, clock, mailbox.clone(), move |news| route.tell(news));
+        let broker = Broker::start(&settings, secrets, clock, mailbox.clone(), move |news| route.tell(news));
         let memories = state.memories();
         let first = (0..buses.len())
             .map(|index| Bus::new(clock.now(), &settings, index, memories).report(clock.now()))
@@ -258,5 +259,5 @@ async fn watch(reporter: Arc<Reporter>, topics: Topics, mailbox: Arc<Mailbox>) {
 fn states(report: &GatewayReport) -> Vec<bool> {
     let buses = report.buses.iter().flat_map(|bus| [bus.report.up, bus.responding]);
     let devices = report.devices().map(|(_, device)| device.online);
-    buses.chain(devices).chain([report.broker.connected]).collect()
+    buses.chain(devices).chain([report.broker.connected, report.broker.client_id_taken]).collect()
 }

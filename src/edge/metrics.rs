@@ -25,6 +25,10 @@ pub fn render(report: &GatewayReport) -> Result<String, fmt::Error> {
     let connected = OneGauge::default();
     connected.set(flag(report.broker.connected));
     registry.register("broker_connected", "Whether the broker is connected", connected);
+    let taken = OneGauge::default();
+    taken.set(flag(report.broker.client_id_taken));
+    let help = "Whether another client with the same identifier takes this one's place again and again";
+    registry.register("broker_client_id_taken", help, taken);
     counter(&mut registry, "broker_connects", "Connections made", report.broker.connects);
     counter(&mut registry, "messages_dropped", "Messages that waited too long", report.broker.dropped);
 
@@ -130,6 +134,7 @@ mod tests {
             .expect("text takes everything");
         for line in [
             "busker_broker_connected 1.0",
+            "busker_broker_client_id_taken 0.0",
             "busker_bus_up{bus=\"cellar\"} 1.0",
             "busker_bus_load_ratio{bus=\"cellar\"} 0.25",
             "busker_bus_requests_total{bus=\"cellar\"} 12",

@@ -11,5 +11,7 @@ pub mod link;
 pub mod metrics;
 pub mod mqtt;
 pub mod reports;
+pub mod secrets;
 pub mod shutdown;
 pub mod state_files;
+pub mod tls;

@@ -4,16 +4,20 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rumqttc::{
-    AsyncClient, ConnectReturnCode, ConnectionError, EventLoop, LastWill, MqttOptions, Packet, QoS,
-    SubscribeFilter, SubscribeReasonCode,
+    AsyncClient, ConnectReturnCode, ConnectionError, EventLoop, LastWill, MqttOptions, Outgoing, Packet,
+    Publish, QoS, Request, StateError, SubscribeFilter, SubscribeReasonCode, TlsError,
 };
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
 
 use crate::edge::clock::Clock;
+use crate::edge::secrets::Secrets;
+use crate::edge::tls;
+use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::connection::{Connection, Loss};
 use crate::engine::health::BrokerReport;
 use crate::engine::outbox::Outbox;
-use crate::engine::settings::Settings;
+use crate::engine::settings::{Mqtt, Settings};
 use crate::engine::time::Duration;
 use crate::engine::topics::{self, Incoming, Message, OFFLINE, ONLINE, Topics};
 
@@ -24,15 +28,6 @@ const IN_FLIGHT: usize = 50;
 /// A device with a thousand points is announced in 215 kB. Larger than anything sane, since a packet
 /// above the limit ends the connection.
 const PACKET_BYTES_MAX: usize = 16 * 1024 * 1024;
-
-/// Half of it after a silent loss of the connection, the broker publishes the last will.
-const KEEP_ALIVE: Duration = Duration::from_secs(15);
-
-const RECONNECT_FIRST: Duration = Duration::from_millis(500);
-const RECONNECT_LAST: Duration = Duration::from_secs(30);
-
-/// A connection that held this long counts as a good one: after it the waits begin anew.
-const GOOD_CONNECTION: Duration = Duration::from_secs(10);
 
 /// How long the last messages may take when the program ends.
 const GOODBYE: Duration = Duration::from_secs(3);
@@ -73,13 +68,18 @@ pub enum News {
 #[derive(Clone)]
 pub struct BrokerState {
     state: Arc<Mutex<BrokerReport>>,
+    connection: Arc<Mutex<Connection>>,
     mailbox: Arc<Mailbox>,
+    clock: Clock,
 }
 
 impl BrokerState {
     pub fn report(&self) -> BrokerReport {
         let mut report = lock(&self.state).clone();
-        report.dropped = self.mailbox.outbox().dropped();
+        report.client_id_taken = lock(&self.connection).is_contested(self.clock.now());
+        let outbox = self.mailbox.outbox();
+        (report.waiting, report.dropped) = (outbox.waiting(), outbox.dropped());
+        drop(outbox);
         report
     }
 }
@@ -95,17 +95,29 @@ impl Broker {
     /// Connects, and goes on connecting. `tell` is called from the runtime and must not wait.
     pub fn start(
         settings: &Settings,
-        password: Option<String>,
+        secrets: Secrets,
         clock: Clock,
         mailbox: Arc<Mailbox>,
         tell: impl Fn(News) + Send + 'static,
     ) -> Broker {
         let topics = Topics::new(&settings.mqtt.base_topic);
-        let (client, event_loop) = AsyncClient::new(options(settings, &topics, password), IN_FLIGHT);
+        let options = options(&settings.mqtt, &topics, secrets);
+        let client_id = options.client_id();
+        let (client, event_loop) = AsyncClient::new(options, IN_FLIGHT);
         let state = Arc::new(Mutex::new(BrokerReport::default()));
+        let connection = Arc::new(Mutex::new(Connection::default()));
         let (events_out, events) = mpsc::channel(IN_FLIGHT);
-        let address = format!("{}:{}", settings.mqtt.host, settings.mqtt.port);
-        let poller = tokio::spawn(poll(event_loop, events_out, address, clock));
+        let poller = Poller {
+            event_loop,
+            seen: events_out,
+            connection: connection.clone(),
+            mqtt: settings.mqtt.clone(),
+            address: format!("{}:{}", settings.mqtt.host, settings.mqtt.port),
+            client_id,
+            unreadable: None,
+            clock,
+        };
+        let poller = tokio::spawn(poller.run());
         let (goodbye, goodbye_heard) = oneshot::channel();
         let mut filters = topics.subscriptions();
         if settings.home_assistant.discovery {
@@ -122,6 +134,7 @@ impl Broker {
             mailbox: mailbox.clone(),
             state: state.clone(),
             connected: false,
+            contested: false,
             told_up: None,
             subscribed: false,
             tell,
@@ -130,7 +143,8 @@ impl Broker {
             feeder.run(events, goodbye_heard).await;
             poller.abort();
         });
-        Broker { state: BrokerState { state, mailbox }, goodbye: Some(goodbye), feeder }
+        let state = BrokerState { state, connection, mailbox, clock };
+        Broker { state, goodbye: Some(goodbye), feeder }
     }
 
     pub fn state(&self) -> BrokerState {
@@ -155,83 +169,249 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn options(settings: &Settings, topics: &Topics, password: Option<String>) -> MqttOptions {
-    // The same after every start: a gateway that was cut off takes its own place again.
+fn options(mqtt: &Mqtt, topics: &Topics, secrets: Secrets) -> MqttOptions {
+    // The same after every start: a gateway that was cut off takes its own place again. And the same
+    // for every gateway with this base topic: of two that would answer for the same devices, the broker
+    // lets in one.
     let client = format!("{}_gateway", topics.instance());
-    let mut options = MqttOptions::new(client, settings.mqtt.host.clone(), settings.mqtt.port);
-    options.set_keep_alive(KEEP_ALIVE);
+    let address = match &mqtt.websocket {
+        None => mqtt.host.clone(),
+        // The library wants a whole URL.
+        Some(path) => {
+            let scheme = if mqtt.tls.is_some() { "wss" } else { "ws" };
+            let host = if mqtt.host.contains(':') { format!("[{}]", mqtt.host) } else { mqtt.host.clone() };
+            format!("{scheme}://{host}:{}{path}", mqtt.port)
+        }
+    };
+    let mut options = MqttOptions::new(client, address, mqtt.port);
+    // Told to the broker in whole seconds.
+    options.set_keep_alive(Duration::from_secs(mqtt.keep_alive.as_millis().div_ceil(1000) as u64));
     // A command is for now: the broker shall not keep any for a gateway that is not there.
     options.set_clean_session(true);
     options.set_max_packet_size(PACKET_BYTES_MAX, PACKET_BYTES_MAX);
     options.set_last_will(LastWill::new(topics.bridge_state(), OFFLINE, QoS::AtLeastOnce, true));
-    if let Some(username) = &settings.mqtt.username {
-        options.set_credentials(username.clone(), password.unwrap_or_default());
-    }
+    secrets.enter(&mut options, mqtt);
     options
 }
 
 /// What the polling task saw.
 enum Seen {
     Up,
-    Down(String),
-    Packet(Packet),
+    Down {
+        reason: String,
+        /// Somebody else takes this gateway's place again and again.
+        contested: bool,
+    },
+    /// Messages told once that the library had taken and the broker has not.
+    Unsent(Vec<Message>),
+    Packet {
+        packet: Packet,
+        /// How old it may be, if it was held up on its way.
+        stale_for: Option<Duration>,
+    },
     /// The library has taken something: there is room for more.
     Room,
 }
 
 /// Polls the client library and nothing else: a library that is not polled neither sends nor answers
-/// pings. Waits between attempts to connect, a little longer each time.
-async fn poll(mut event_loop: EventLoop, seen: mpsc::Sender<Seen>, address: String, clock: Clock) {
-    let mut attempts = 0;
-    let mut connected_at = None;
-    loop {
-        let news = match event_loop.poll().await {
-            Ok(rumqttc::Event::Incoming(Packet::ConnAck(_))) => {
-                connected_at = Some(clock.now());
-                Seen::Up
-            }
-            Ok(rumqttc::Event::Incoming(packet)) => Seen::Packet(packet),
-            Ok(rumqttc::Event::Outgoing(_)) => Seen::Room,
-            Err(error) => {
-                // A collision of packet numbers from the old connection would stop publishing for ever.
-                event_loop.state.collision = None;
-                if seen.send(Seen::Down(reason(&error, &address))).await.is_err() {
-                    return;
+/// pings. Waits between attempts to connect.
+struct Poller {
+    event_loop: EventLoop,
+    seen: mpsc::Sender<Seen>,
+    connection: Arc<Mutex<Connection>>,
+    mqtt: Mqtt,
+    address: String,
+    client_id: String,
+    /// Why its files could not be read, the last time.
+    unreadable: Option<String>,
+    clock: Clock,
+}
+
+impl Poller {
+    /// Until nobody listens.
+    async fn run(mut self) {
+        loop {
+            let seen = match self.event_loop.poll().await {
+                Ok(rumqttc::Event::Incoming(Packet::ConnAck(_))) => {
+                    let wait = lock(&self.connection).made(self.clock.now());
+                    tokio::time::sleep(wait).await;
+                    Seen::Up
                 }
-                // Two gateways of one name throw each other out; then the waits shall grow as well.
-                if connected_at.take().is_some_and(|since| clock.now() - since >= GOOD_CONNECTION) {
-                    attempts = 0;
+                Ok(event) => self.seen(event),
+                Err(error) => {
+                    if self.lost(error).await.is_err() {
+                        return;
+                    }
+                    continue;
                 }
-                tokio::time::sleep(reconnect_after(attempts, clock.now().0)).await;
-                attempts += 1;
-                continue;
+            };
+            if self.seen.send(seen).await.is_err() {
+                return;
             }
+        }
+    }
+
+    fn seen(&self, event: rumqttc::Event) -> Seen {
+        let now = self.clock.now();
+        let mut connection = lock(&self.connection);
+        match event {
+            rumqttc::Event::Incoming(packet) => {
+                connection.heard(now);
+                Seen::Packet { packet, stale_for: connection.stale_for(now) }
+            }
+            rumqttc::Event::Outgoing(sent) => {
+                if let Outgoing::Publish(_) | Outgoing::Subscribe(_) | Outgoing::PingReq = sent {
+                    connection.asked(now);
+                }
+                Seen::Room
+            }
+        }
+    }
+
+    /// Tells what is left of the connection, and waits before the next attempt.
+    async fn lost(&mut self, error: ConnectionError) -> Result<(), mpsc::error::SendError<Seen>> {
+        // What came together with the end. The library would hand it out after the next connect,
+        // when a command in it is no longer meant.
+        for event in std::mem::take(&mut self.event_loop.state.events) {
+            if let rumqttc::Event::Incoming(_) = event {
+                self.seen.send(self.seen(event)).await?;
+            }
+        }
+        // A collision of packet numbers from the old connection would stop publishing for ever.
+        let collided = self.event_loop.state.collision.take();
+        let now = self.clock.now();
+        let (was_made, pause, contested) = {
+            let mut connection = lock(&self.connection);
+            let was_made = connection.is_made();
+            let pause = connection.lost(now, loss(&error), now.0);
+            (was_made, pause, connection.is_contested(now))
         };
-        if seen.send(news).await.is_err() {
-            return;
+        let reason = match contested {
+            true => format!(
+                "the broker at {} lets this gateway in and closes the connection, again and again: most likely \
+                 another client has the identifier `{}` too, as a second gateway with `base_topic: {}` has. Each \
+                 needs a base topic of its own; this one tries again after growing pauses",
+                self.address, self.client_id, self.mqtt.base_topic
+            ),
+            false => self.reason(&error, was_made),
+        };
+        self.seen.send(Seen::Down { reason, contested }).await?;
+        tokio::time::sleep(pause).await;
+        // Only now, when nobody hands over more: the library would send what it still holds before
+        // anything newer, or drop it.
+        self.event_loop.clean();
+        let requests = self.event_loop.pending.drain(..).filter_map(|request| match request {
+            Request::Publish(publish) => Some(publish),
+            _ => None,
+        });
+        let unsent: Vec<Message> =
+            requests.chain(collided).filter(|publish| !publish.retain).filter_map(once).collect();
+        self.renew_secrets();
+        self.seen.send(Seen::Unsent(unsent)).await
+    }
+
+    /// They may have changed since the last attempt. While they cannot be read, the old ones are used.
+    fn renew_secrets(&mut self) {
+        match Secrets::read(&self.mqtt) {
+            Ok(secrets) => {
+                self.unreadable = None;
+                secrets.enter(&mut self.event_loop.mqtt_options, &self.mqtt);
+            }
+            Err(error) => {
+                let reason = format!("{error:#}");
+                if self.unreadable.as_ref() != Some(&reason) {
+                    tracing::warn!("going on with what was read before: {reason}");
+                }
+                self.unreadable = Some(reason);
+            }
+        }
+    }
+
+    /// Without credentials, since the library's errors hold none.
+    fn reason(&self, error: &ConnectionError, was_made: bool) -> String {
+        let address = &self.address;
+        if let Some(advice) = rustls_error(error).and_then(tls::advice) {
+            return format!("no TLS with the broker at {address}: {advice} ({})", told(error));
+        }
+        match error {
+            ConnectionError::ConnectionRefused(
+                ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
+            ) => format!("the broker at {address} refuses this user name and password"),
+            ConnectionError::ConnectionRefused(code) => format!("the broker at {address} refuses: {code:?}"),
+            ConnectionError::Io(error) => format!("no connection to the broker at {address}: {error}"),
+            ConnectionError::NetworkTimeout => format!("the broker at {address} does not answer"),
+            ConnectionError::MqttState(StateError::AwaitPingResp) | ConnectionError::FlushTimeout => {
+                format!("the broker at {address} is silent")
+            }
+            ConnectionError::Tls(_) => format!(
+                "no TLS with the broker at {address}: {}; does it speak TLS on this port?",
+                told(error)
+            ),
+            error if loss(error) == Loss::Closed && !was_made => format!(
+                "the broker at {address} closes the connection before it lets this gateway in; does it want \
+                 TLS (`mqtts://`)?"
+            ),
+            error if loss(error) == Loss::Closed => format!(
+                "the broker at {address} has closed the connection: it ends, or another client has come with \
+                 the identifier `{}`",
+                self.client_id
+            ),
+            error => format!("the connection to the broker at {address} is lost: {}", told(error)),
         }
     }
 }
 
-/// Doubles with each attempt up to a bound, and varies by a quarter, so that many gateways do not come
-/// back to a restarted broker in the same moment. `seed` is any number that varies.
-fn reconnect_after(attempts: u32, seed: u64) -> Duration {
-    let full = RECONNECT_FIRST.saturating_mul(1 << attempts.min(10)).min(RECONNECT_LAST);
-    // The middle of a product with a large odd number is as good as random.
-    let spread = (seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as u32 % 256;
-    full - full / 4 * spread / 256
+/// A message that the library gives back.
+fn once(publish: Publish) -> Option<Message> {
+    // It was text when it was handed over.
+    Some(Message::once(publish.topic, String::from_utf8(publish.payload.to_vec()).ok()?))
 }
 
-/// Without credentials, since the library's errors hold none.
-fn reason(error: &ConnectionError, address: &str) -> String {
+fn loss(error: &ConnectionError) -> Loss {
+    use std::io::ErrorKind;
     match error {
-        ConnectionError::ConnectionRefused(
-            ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
-        ) => format!("the broker at {address} refuses this user name and password"),
-        ConnectionError::ConnectionRefused(code) => format!("the broker at {address} refuses: {code:?}"),
-        ConnectionError::Io(error) => format!("no connection to the broker at {address}: {error}"),
-        error => format!("the connection to the broker at {address} is lost: {error}"),
+        ConnectionError::MqttState(StateError::ConnectionAborted) => Loss::Closed,
+        ConnectionError::NetworkTimeout
+        | ConnectionError::FlushTimeout
+        | ConnectionError::MqttState(StateError::AwaitPingResp | StateError::CollisionTimeout) => {
+            Loss::Silent
+        }
+        error => match io_error(error).map(std::io::Error::kind) {
+            Some(ErrorKind::ConnectionReset | ErrorKind::UnexpectedEof | ErrorKind::BrokenPipe) => {
+                Loss::Closed
+            }
+            Some(ErrorKind::TimedOut) => Loss::Silent,
+            _ => Loss::Failed,
+        },
     }
+}
+
+/// The error of the connection below MQTT, if it was one.
+fn io_error(error: &ConnectionError) -> Option<&std::io::Error> {
+    let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(error);
+    while let Some(error) = cause {
+        if let Some(error) = error.downcast_ref() {
+            return Some(error);
+        }
+        cause = error.source();
+    }
+    None
+}
+
+fn rustls_error(error: &ConnectionError) -> Option<&rustls::Error> {
+    if let ConnectionError::Tls(TlsError::TLS(error)) = error {
+        return Some(error);
+    }
+    io_error(error)?.get_ref()?.downcast_ref()
+}
+
+/// The innermost error, which says it without the library's own words.
+fn told(error: &ConnectionError) -> String {
+    let mut cause: &dyn std::error::Error = error;
+    while let Some(source) = cause.source() {
+        cause = source;
+    }
+    cause.to_string()
 }
 
 /// Feeds the library from the outbox and hands on what comes in.
@@ -244,6 +424,8 @@ struct Feeder<Tell> {
     mailbox: Arc<Mailbox>,
     state: Arc<Mutex<BrokerReport>>,
     connected: bool,
+    /// Whether the last connection was lost to somebody else with our identifier.
+    contested: bool,
     /// What was last told of the connection.
     told_up: Option<bool>,
     subscribed: bool,
@@ -292,13 +474,16 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.told_up = Some(true);
                 (self.tell)(News::Up);
             }
-            Seen::Down(reason) => {
+            Seen::Down { reason, contested } => {
                 let mut state = lock(&self.state);
                 state.connected = false;
-                // Once for each reason, not once for each attempt.
-                if state.reason.as_ref() != Some(&reason) {
+                // Once for each reason, not once for each attempt; and a quarrel once, not each time
+                // that it is lost.
+                let is_known = state.reason.as_ref() == Some(&reason) || (contested && self.contested);
+                if !is_known {
                     tracing::warn!("{reason}");
                 }
+                self.contested = contested;
                 state.reason = Some(reason);
                 drop(state);
                 self.connected = false;
@@ -307,20 +492,31 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                     (self.tell)(News::Down);
                 }
             }
-            Seen::Packet(Packet::Publish(publish)) => {
+            Seen::Unsent(messages) => self.mailbox.outbox().give_back(messages),
+            Seen::Packet { packet: Packet::Publish(publish), stale_for } => {
                 let payload = String::from_utf8_lossy(&publish.payload).into_owned();
-                self.receive(&publish.topic, payload, publish.retain);
+                // A broker repeats only what it has kept from an earlier connection.
+                let stale = match (publish.dup, stale_for) {
+                    (true, _) => Some("the broker has kept it from an earlier connection".to_string()),
+                    (false, Some(age)) => Some(format!(
+                        "the broker or the way to it was stalled; it may be {} s old",
+                        age.as_secs()
+                    )),
+                    (false, None) => None,
+                };
+                self.receive(&publish.topic, payload, publish.retain, stale);
             }
-            Seen::Packet(Packet::SubAck(answer)) => {
+            Seen::Packet { packet: Packet::SubAck(answer), .. } => {
                 if answer.return_codes.contains(&SubscribeReasonCode::Failure) {
                     tracing::warn!("the broker does not let this user subscribe; commands will not arrive");
                 }
             }
-            Seen::Packet(_) | Seen::Room => {}
+            Seen::Packet { .. } | Seen::Room => {}
         }
     }
 
-    fn receive(&self, topic: &str, payload: String, retained: bool) {
+    /// `stale` says why a command would be too old to be obeyed.
+    fn receive(&self, topic: &str, payload: String, retained: bool, stale: Option<String>) {
         if topic == self.status_topic {
             // A retained birth message is old news: everything was sent when the connection was made.
             if payload == ONLINE && !retained {
@@ -336,6 +532,13 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             return;
         }
         match self.topics.parse(topic) {
+            Some(Incoming::Set { device, point }) if !retained && stale.is_some() => {
+                let reason = stale.unwrap_or_default();
+                tracing::warn!("`{topic}` is not obeyed: {reason}");
+                let outcome = Outcome::new(OutcomeKind::Expired, &payload, &reason);
+                let topic = self.topics.outcome(device, point);
+                self.mailbox.outbox().push(Message::once(topic, outcome.to_json()));
+            }
             Some(Incoming::Set { device, point }) => {
                 let (device, point) = (device.to_string(), point.to_string());
                 (self.tell)(News::Set { device, point, payload, retained });
@@ -376,7 +579,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             }
         }
         while let Some(seen) = events.recv().await {
-            if matches!(seen, Seen::Down(_)) {
+            if matches!(seen, Seen::Down { .. }) {
                 return;
             }
         }
@@ -386,14 +589,46 @@ impl<Tell: Fn(News)> Feeder<Tell> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::settings::Password;
 
+    /// The library keeps such a message, and would hand it out after the next connect.
     #[test]
-    fn the_wait_between_attempts_grows_to_a_bound_and_varies() {
-        for (attempts, longest) in [(0, 500), (1, 1000), (2, 2000), (6, 30_000), (40, 30_000)] {
-            let waits: Vec<Duration> = (0..100).map(|seed| reconnect_after(attempts, seed * 1017)).collect();
-            let longest = Duration::from_millis(longest);
-            assert!(waits.iter().all(|wait| *wait <= longest && *wait >= longest * 3 / 4), "{waits:?}");
-            assert!(waits.iter().min() != waits.iter().max());
-        }
+    fn what_came_with_the_end_of_a_connection_is_handed_on_before_the_end_is_told() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
+        runtime.block_on(async {
+            let (_client, mut event_loop) = AsyncClient::new(MqttOptions::new("id", "localhost", 1883), 10);
+            let command = Publish::new("busker/a/b/set", QoS::AtLeastOnce, "ON");
+            let command = Packet::Publish(command);
+            event_loop.state.events.push_back(rumqttc::Event::Incoming(command.clone()));
+            let (seen, mut events) = mpsc::channel(10);
+            let mqtt = Mqtt {
+                host: "localhost".into(),
+                port: 1883,
+                websocket: None,
+                tls: None,
+                keep_alive: Duration::from_secs(15),
+                username: None,
+                password: Password::None,
+                base_topic: "busker".into(),
+            };
+            let mut poller = Poller {
+                event_loop,
+                seen,
+                connection: Arc::new(Mutex::new(Connection::default())),
+                mqtt,
+                address: "localhost:1883".into(),
+                client_id: "id".into(),
+                unreadable: None,
+                clock: Clock::start(),
+            };
+            lock(&poller.connection).made(poller.clock.now());
+            let end = ConnectionError::MqttState(StateError::ConnectionAborted);
+            let task = tokio::spawn(async move { poller.lost(end).await.is_ok() });
+            let first = events.recv().await.expect("two things are told");
+            assert!(matches!(first, Seen::Packet { packet, stale_for: None } if packet == command));
+            let second = events.recv().await.expect("two things are told");
+            assert!(matches!(second, Seen::Down { reason, contested: false } if reason.contains("`id`")));
+            task.abort();
+        });
     }
 }

@@ -273,6 +273,10 @@ pub struct BrokerReport {
     pub reason: Option<String>,
     /// How often the connection was made since the start.
     pub connects: u64,
+    /// Another client with the same identifier takes this gateway's place again and again.
+    pub client_id_taken: bool,
+    /// Messages that wait for it: at most one for each retained topic, and those told once.
+    pub waiting: usize,
     /// Messages told once that were dropped since too many waited.
     pub dropped: u64,
 }
@@ -317,7 +321,7 @@ impl GatewayReport {
         let mut devices = self.buses.iter().flat_map(|bus| &bus.report.devices);
         if !self.broker.connected || self.buses.iter().any(|bus| bus.is_lost() || !bus.responding) {
             Status::Lost
-        } else if devices.any(|device| !device.online) {
+        } else if self.broker.client_id_taken || devices.any(|device| !device.online) {
             Status::Degraded
         } else {
             Status::Ok

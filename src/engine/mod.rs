@@ -28,7 +28,9 @@ pub mod schedule;
 pub mod identity;
 pub mod state;
 
-// Tell: topics, discovery, health, and what waits for the broker or has changed for who watches.
+// Tell: topics, discovery, health, what waits for the broker and when to look for it, and what has
+// changed for who watches.
+pub mod connection;
 pub mod feed;
 pub mod health;
 pub mod homeassistant;

@@ -121,6 +121,18 @@ impl Outbox {
         }
     }
 
+    /// Messages told once, in their order, that were handed over and did not arrive: they are next
+    /// again, as far as there is room.
+    pub fn give_back(&mut self, messages: Vec<Message>) {
+        for message in messages.into_iter().rev() {
+            if self.once_waiting < ONCE_MAX {
+                self.put_back(message);
+            } else {
+                self.dropped += 1;
+            }
+        }
+    }
+
     /// The broker remembers this announcement, perhaps of an earlier run. What it holds and we do not
     /// have any more is taken away properly; announcements that are not ours are left alone.
     pub fn found(&mut self, topic: &str, payload: &str) {
@@ -217,6 +229,11 @@ impl Outbox {
             entry.queued = false;
         }
         self.push_retained(Message::retained(topic, OFFLINE));
+    }
+
+    /// Messages that wait.
+    pub fn waiting(&self) -> usize {
+        self.queue.len()
     }
 
     /// Messages told once that were pushed out since the start.

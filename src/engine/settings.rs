@@ -2,7 +2,7 @@
 //! `configuration::file`.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::engine::device::{Device, PointIndex};
 use crate::engine::time::Duration;
@@ -21,11 +21,36 @@ pub struct Settings {
     pub devices: Vec<DeviceSettings>,
 }
 
+impl Settings {
+    /// Takes relative paths of secrets and certificates from `folder`, in which the configuration lies.
+    pub fn resolve_files(&mut self, folder: &Path) {
+        let resolve = |path: &mut PathBuf| *path = folder.join(&*path);
+        for secret in [&mut self.mqtt.password, &mut self.http.token] {
+            if let Password::File(path) = secret {
+                resolve(path);
+            }
+        }
+        if let Some(tls) = &mut self.mqtt.tls {
+            tls.ca_file.as_mut().map(resolve);
+            if let Some(client) = &mut tls.client {
+                resolve(&mut client.cert_file);
+                resolve(&mut client.key_file);
+            }
+        }
+    }
+}
+
 #[derive(Clone, PartialEq, Eq)]
 pub struct Mqtt {
     pub host: String,
     pub port: u16,
-    pub tls: bool,
+    /// Where MQTT travels in a websocket, the path of its URL.
+    pub websocket: Option<String>,
+    /// `None`: not encrypted.
+    pub tls: Option<Tls>,
+    /// After this time without a message the broker is asked for a sign of life; a second one without
+    /// an answer is the end of the connection.
+    pub keep_alive: Duration,
     pub username: Option<String>,
     pub password: Password,
     /// One per gateway where several share a broker.
@@ -37,6 +62,20 @@ impl fmt::Debug for Mqtt {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Mqtt({}:{}, base topic {})", self.host, self.port, self.base_topic)
     }
+}
+
+/// How the broker proves itself, and how we do; the edge reads the files.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Tls {
+    /// The only authorities that are trusted; `None`: those of the system.
+    pub ca_file: Option<PathBuf>,
+    pub client: Option<ClientCertificate>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ClientCertificate {
+    pub cert_file: PathBuf,
+    pub key_file: PathBuf,
 }
 
 /// Where the broker's password, or HTTP's token, comes from; the edge reads the file.

@@ -11,7 +11,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
     &["yaml", "device", "test_device", "codec", "units", "settings", "profile", "wanted", "configuration"],
     &["modbus", "plan", "schedule"],
     &["identity", "state"],
-    &["topics", "health", "feed", "homeassistant", "outbox"],
+    &["topics", "health", "feed", "homeassistant", "outbox", "connection"],
     &["command", "memory", "upkeep", "bus"],
 ];
 

@@ -41,7 +41,9 @@ pub fn settings(header: &str) -> Settings {
         mqtt: Mqtt {
             host: "localhost".into(),
             port: 1883,
-            tls: false,
+            websocket: None,
+            tls: None,
+            keep_alive: Duration::from_secs(15),
             username: None,
             password: Password::None,
             base_topic: "busker".into(),

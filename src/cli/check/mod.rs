@@ -39,7 +39,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
         return print_json(&engine::configuration::schema());
     }
     let file = args.configuration.config.display().to_string();
-    match configuration::load(&args.configuration.config)? {
+    match checked(&args)? {
         Ok(loaded) => {
             let summary = Summary::of(file, &loaded);
             if args.json {
@@ -58,6 +58,17 @@ pub fn run(args: Args) -> Result<(), Failure> {
             Err(configuration::faults(faults))
         }
     }
+}
+
+/// The configuration, and the files that it names.
+fn checked(args: &Args) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
+    let loaded = configuration::load(&args.configuration.config)?;
+    Ok(loaded.and_then(|mut loaded| {
+        let secret_faults = loaded.secret_faults();
+        loaded.warnings.extend(secret_faults);
+        let faults = loaded.tls_faults();
+        if faults.is_empty() { Ok(loaded) } else { Err(faults) }
+    }))
 }
 
 /// What there is to say about a good configuration.

@@ -7,7 +7,7 @@ use std::marker::PhantomData;
 use serde_json::json;
 
 use crate::engine::configuration::words::{
-    BaudRate, BrokerUrl, HostPort, Listen, Name, NoTls, Part, StopBits, Token, Topic, Unit,
+    BaudRate, BrokerUrl, HostPort, Listen, Name, Part, StopBits, Token, Topic, Unit,
 };
 use crate::engine::device::Poll;
 use crate::engine::profile::file::{Intervals, Point, Presentation, Thing, Wire};
@@ -47,17 +47,36 @@ record! {
 record! {
     /// The broker.
     pub struct Mqtt {
-        /// Where it listens.
-        url: At<BrokerUrl> = At::nowhere(BrokerUrl { host: "localhost".into(), port: 1883 }),
+        /// Where it listens: `mqtt://host:1883`, with TLS `mqtts://host:8883`; through a websocket
+        /// `ws://host:80/mqtt`, with TLS `wss://host:443/mqtt`. Port and path are these unless said.
+        url: At<BrokerUrl> = At::nowhere(BrokerUrl::localhost()),
         username: Option<At<String>>,
-        /// Better kept in a file of its own, see `password_file`.
+        /// Better kept in a file of its own, see `password_file`. Where neither is given, the environment
+        /// may hold it in `BUSKER_MQTT_PASSWORD`, else systemd in the credential `mqtt-password`.
         password: Option<At<String>>,
-        /// A file whose first line is the password.
+        /// A file whose first line is the password. A relative path is meant from where this file lies.
         password_file: Option<At<String>>,
         /// The first level of all topics; one per gateway where several share a broker.
         base_topic: At<Topic> = At::nowhere(Topic("busker".into())),
-        /// Not in this version.
-        tls: Option<NoTls>,
+        /// Certificates, where the URL asks for TLS.
+        tls: Option<Tls>,
+        /// After this time without a message the broker is asked for a sign of life; after a second one
+        /// without an answer it is lost.
+        keep_alive: At<Duration> = At::nowhere(Duration::from_secs(15)),
+    }
+}
+
+record! {
+    /// Certificates for TLS, each a path to a file in the form PEM. A relative path is meant from where
+    /// this file lies.
+    pub struct Tls {
+        /// The certificates of the authorities that may vouch for the broker; those of the system
+        /// unless said.
+        ca_file: Option<At<String>>,
+        /// The certificate by which this gateway proves itself to the broker.
+        cert_file: Option<At<String>>,
+        /// The key that belongs to `cert_file`.
+        key_file: Option<At<String>>,
     }
 }
 
@@ -81,7 +100,7 @@ record! {
         /// What a reader must send as bearer token to see anything but `/health`. Better kept in a file of
         /// its own, see `token_file`.
         token: Option<At<Token>>,
-        /// A file whose first line is the token.
+        /// A file whose first line is the token. A relative path is meant from where this file lies.
         token_file: Option<At<String>>,
     }
 }

@@ -16,7 +16,8 @@ use crate::engine::device::Device;
 use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
-    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password, Settings, Wanted,
+    Bus, ClientCertificate, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password,
+    Settings, Tls, Wanted,
 };
 use crate::engine::time::Duration;
 use crate::engine::yaml::{
@@ -56,6 +57,28 @@ pub fn profile_folders(file_name: &str, bytes: &[u8]) -> Vec<At<String>> {
     let node = source.and_then(|source| parse(&source, &mut faults));
     let folders = node.as_ref().and_then(|node| node.get("profiles"));
     folders.and_then(|folders| read(folders, &mut faults)).unwrap_or_default()
+}
+
+/// A fault that only the edge can find, at the value that these keys lead to, `["mqtt", "tls"]`: what a
+/// file says that the configuration names. Shown without the configuration's secrets.
+pub fn fault_at(file_name: &str, bytes: &[u8], keys: &[&str], message: String) -> Diagnostic {
+    let mut unread = Faults::default();
+    let source = Source::from_bytes(file_name, bytes, &mut unread);
+    let node = source.as_ref().and_then(|source| parse(source, &mut unread));
+    let mut found = node.as_ref();
+    for key in keys {
+        found = found.map(|node| node.get(key).unwrap_or(node));
+    }
+    let mut faults = Faults::default();
+    let place = found.map_or_else(Place::nowhere, |node| match node.content {
+        Content::Scalar { .. } => node.place.clone(),
+        Content::Map(_) | Content::List(_) => node.named_at().clone(),
+    });
+    faults.add(&place, message.clone());
+    if let Some(source) = source {
+        faults.show_by(&Source::new(file_name, &secrets::hidden(source.text())));
+    }
+    faults.into_sorted().pop().unwrap_or(Diagnostic { place, message })
 }
 
 /// The settings in `bytes`, a file with nothing but what stands under a device's `settings:`.
@@ -111,6 +134,7 @@ impl Resolver<'_> {
     }
 
     fn mqtt(&mut self, file: &file::Mqtt) -> Mqtt {
+        self.within(Some(&file.keep_alive), Duration::from_secs(1), Duration::from_secs(3600));
         let (password, password_file) = (file.password.as_ref(), file.password_file.as_ref());
         self.one_of_two("password", password.map(|at| &at.place), password_file.map(|at| &at.place));
         let secret = file.password.as_ref().or(file.password_file.as_ref());
@@ -120,7 +144,9 @@ impl Resolver<'_> {
         Mqtt {
             host: file.url.host.clone(),
             port: file.url.port,
-            tls: false,
+            websocket: file.url.websocket.clone(),
+            tls: self.tls(file),
+            keep_alive: file.keep_alive.value,
             username: file.username.as_ref().map(|username| username.value.clone()),
             password: match (&file.password, &file.password_file) {
                 (Some(password), _) => Password::Given(password.value.clone()),
@@ -137,6 +163,36 @@ impl Resolver<'_> {
             self.faults.add(&file.daily.place, "no writes at all; expected at least 1 a day");
         }
         Eeprom { interval: file.interval.value, daily: file.daily.value.into() }
+    }
+
+    fn tls(&mut self, file: &file::Mqtt) -> Option<Tls> {
+        let given = file.tls.as_ref();
+        if let Some(given) = given.filter(|_| !file.url.tls) {
+            let message = "certificates, and a `url` that does not ask for TLS; write `mqtts://` or `wss://` \
+                           there, or remove `tls`";
+            self.faults.add(&given.place, message);
+            return None;
+        }
+        if !file.url.tls {
+            return None;
+        }
+        let Some(given) = given else { return Some(Tls::default()) };
+        let path = |file: &At<String>| PathBuf::from(&file.value);
+        let client = match (&given.cert_file, &given.key_file) {
+            (Some(certificate), Some(key)) => {
+                Some(ClientCertificate { cert_file: path(certificate), key_file: path(key) })
+            }
+            (None, None) => None,
+            (Some(lonely), None) => {
+                self.faults.add(&lonely.place, "a certificate without its `key_file`");
+                None
+            }
+            (None, Some(lonely)) => {
+                self.faults.add(&lonely.place, "a key without its `cert_file`");
+                None
+            }
+        };
+        Some(Tls { ca_file: given.ca_file.as_ref().map(path), client })
     }
 
     fn http(&mut self, file: &file::Http) -> Http {

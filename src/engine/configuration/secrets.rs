@@ -26,6 +26,13 @@ fn hidden_in_line(line: &str) -> String {
         let start = line.find(':').map_or(0, |colon| colon + 1).min(end);
         stars(&mut hidden[start..end]);
     }
+    // `wss://host/mqtt?token=…`
+    if let Some(start) = line.find("://") {
+        if let Some(query) = line[start..].find('?') {
+            let end = line[start..].find([' ', '\'', '"']).map_or(line.len(), |end| start + end);
+            stars(&mut hidden[start + query + 1..end.max(start + query + 1)]);
+        }
+    }
     String::from_utf8(hidden).unwrap_or_default()
 }
 
@@ -52,6 +59,7 @@ mod tests {
             ("url: mqtt://joe:p@ss@host:1\n", "url: mqtt://********@host:1\n"),
             ("url: joe:pw@host\n", "url: ******@host\n"),
             ("url: mqtt://host:1\n", "url: mqtt://host:1\n"),
+            ("url: 'wss://host/mqtt?token=x', a: b\n", "url: 'wss://host/mqtt?*******', a: b\n"),
             ("serial: /dev/serial/by-id/usb@1\n", "serial: /dev/serial/by-id/usb@1\n"),
         ] {
             assert_eq!(hidden(text), shown);

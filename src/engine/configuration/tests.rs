@@ -86,7 +86,8 @@ devices:
 fn every_key_has_its_place() {
     let (settings, warnings) = good(
         "
-mqtt: {url: 'mqtt://[fe80::1]:1884', username: busker, password_file: /p, base_topic: house/busker}
+mqtt: {url: 'mqtt://[fe80::1]:1884', username: busker, password_file: /p, base_topic: house/busker,
+       keep_alive: 1m}
 home_assistant: {discovery: false, prefix: ha, status_topic: ha/up}
 http: {listen: 'localhost:0', token: s3cret}
 state_dir: /tmp/state
@@ -102,6 +103,7 @@ devices:
     );
     assert_eq!((settings.mqtt.host.as_str(), settings.mqtt.port), ("fe80::1", 1884));
     assert_eq!(settings.mqtt.base_topic, "house/busker");
+    assert_eq!(settings.mqtt.keep_alive, Duration::from_secs(60));
     assert!(settings.mqtt.password == Password::File("/p".into()));
     assert_eq!(
         settings.home_assistant,
@@ -145,6 +147,56 @@ fn what_is_left_out_has_the_documented_default() {
     assert!(settings.http.token == Password::None);
     let http = good("buses: {}\nhttp: {listen: null, token_file: /t}\n").0.http;
     assert!(http.listen.is_none() && http.token == Password::File("/t".into()));
+}
+
+#[test]
+fn the_url_says_how_the_broker_is_reached() {
+    for (url, host, port, tls, websocket) in [
+        ("mqtt://h", "h", 1883, false, None),
+        ("mqtt://h/", "h", 1883, false, None),
+        ("mqtts://h", "h", 8883, true, None),
+        ("mqtts://[fe80::1]:1", "fe80::1", 1, true, None),
+        ("ws://h", "h", 80, false, Some("/mqtt")),
+        ("ws://h:9001/", "h", 9001, false, Some("/")),
+        ("wss://h/a/b", "h", 443, true, Some("/a/b")),
+    ] {
+        let mqtt = good(&format!("mqtt: {{url: '{url}'}}\nbuses: {{}}\n")).0.mqtt;
+        let found = (mqtt.host.as_str(), mqtt.port, mqtt.tls.is_some(), mqtt.websocket.as_deref());
+        assert_eq!(found, (host, port, tls, websocket), "{url}");
+    }
+}
+
+#[test]
+fn files_are_meant_from_where_the_configuration_lies() {
+    let (mut settings, _) = good(
+        "
+mqtt:
+  url: mqtts://h
+  username: u
+  password_file: password
+  tls: {ca_file: /ca.pem, cert_file: own/cert.pem, key_file: own/key.pem}
+http: {token_file: token}
+buses: {}
+",
+    );
+    settings.resolve_files(std::path::Path::new("/etc/busker"));
+    assert!(settings.mqtt.password == Password::File("/etc/busker/password".into()));
+    assert!(settings.http.token == Password::File("/etc/busker/token".into()));
+    let client = ClientCertificate {
+        cert_file: "/etc/busker/own/cert.pem".into(),
+        key_file: "/etc/busker/own/key.pem".into(),
+    };
+    assert_eq!(settings.mqtt.tls, Some(Tls { ca_file: Some("/ca.pem".into()), client: Some(client) }));
+}
+
+#[test]
+fn a_fault_in_a_named_file_is_told_where_it_is_named_and_without_the_password() {
+    let text = b"mqtt: {url: mqtts://h, tls: {ca_file: nowhere}, username: u, password: s3cret}\n";
+    let fault = fault_at("f", text, &["mqtt", "tls", "ca_file"], "cannot read `nowhere`".into()).to_string();
+    assert!(fault.starts_with("f:1:39: cannot read `nowhere`\n"), "{fault}");
+    assert!(!fault.contains("s3cret"), "{fault}");
+    let fault = fault_at("f", b"buses: {}\n", &["mqtt", "url"], "no".into()).to_string();
+    assert!(fault.starts_with("f:1:1: no\n"), "{fault}");
 }
 
 #[test]

@@ -204,47 +204,81 @@ fn parse_host(text: &str) -> Option<String> {
     (!text.is_empty() && text.chars().all(good)).then(|| text.to_string())
 }
 
-/// `mqtt://host:port`; the port is 1883 unless said.
+/// `mqtt://host:port`, `mqtts://host:port`, `ws://host:port/path` or `wss://host:port/path`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BrokerUrl {
     pub host: String,
     pub port: u16,
+    pub tls: bool,
+    /// The path of a websocket.
+    pub websocket: Option<String>,
+}
+
+impl BrokerUrl {
+    pub fn localhost() -> BrokerUrl {
+        BrokerUrl { host: "localhost".into(), port: 1883, tls: false, websocket: None }
+    }
 }
 
 impl Scalar for BrokerUrl {
-    const EXPECTED: &'static str = "a URL like `mqtt://localhost:1883`";
+    const EXPECTED: &'static str = "a URL like `mqtt://localhost:1883` or `mqtts://broker.example:8883`";
 
     fn parse(text: &str) -> Result<BrokerUrl, String> {
         // Before anything that would repeat the text: there is a password in it.
         if text.contains('@') {
             return Err("a user stands in the URL; use the keys `username` and `password_file`".into());
         }
+        if text.contains('?') {
+            return Err("a query stands in the URL; expected nothing behind the path".into());
+        }
         let expected = Self::EXPECTED;
-        let address = match text.split_once("://") {
-            Some(("mqtt", address)) => address,
-            Some(("mqtts" | "ssl", _)) => {
+        let Some((scheme, rest)) = text.split_once("://") else {
+            return Err(format!("`{text}` is no URL; expected {expected}"));
+        };
+        let (usual_port, tls, is_websocket) = match scheme {
+            "mqtt" => (1883, false, false),
+            "mqtts" => (8883, true, false),
+            "ws" => (80, false, true),
+            "wss" => (443, true, true),
+            _ => {
                 return Err(format!(
-                    "`{text}` asks for TLS, which this version does not have; expected {expected}"
+                    "`{scheme}` is no way to a broker; expected one of `mqtt`, `mqtts` (TLS), `ws` (websocket) \
+                     and `wss` (websocket with TLS)"
                 ));
             }
-            Some((other, _)) => return Err(format!("`{other}` is no way to a broker; expected {expected}")),
-            None => return Err(format!("`{text}` is no URL; expected {expected}")),
         };
-        let address = address.strip_suffix('/').unwrap_or(address);
+        let (address, path) = match rest.find('/') {
+            Some(slash) => rest.split_at(slash),
+            None => (rest, ""),
+        };
+        let websocket = match (is_websocket, path) {
+            (false, "" | "/") => None,
+            (false, _) => {
+                return Err(format!("`{path}` leads nowhere: only a websocket (`ws`, `wss`) has a path"));
+            }
+            // What brokers listen on, where they care.
+            (true, "") => Some("/mqtt".to_string()),
+            (true, path)
+                if path.bytes().all(|byte| byte.is_ascii_graphic() && !b"?#\"<>".contains(&byte)) =>
+            {
+                Some(path.to_string())
+            }
+            (true, _) => return Err(format!("`{path}` is no path; expected one like `/mqtt`")),
+        };
         let ends_in_host = address.ends_with(']') || !address.contains(':');
         let (host, port) = match address.rsplit_once(':') {
             Some((host, port)) if !ends_in_host => (host, parse_port(port)?),
-            _ => (address, 1883),
+            _ => (address, usual_port),
         };
         match parse_host(host) {
             Some(_) if port == 0 => Err(format!("port 0 in `{text}`; expected {expected}")),
-            Some(host) => Ok(BrokerUrl { host, port }),
+            Some(host) => Ok(BrokerUrl { host, port, tls, websocket }),
             None => Err(format!("`{host}` is no host; expected {expected}")),
         }
     }
 
     fn schema() -> Json {
-        json!({"type": "string", "pattern": "^mqtt://[^@/]+/?$"})
+        json!({"type": "string", "pattern": "^(mqtts?://[^@/]+/?|wss?://[^@/]+(/[^@?#]*)?)$"})
     }
 }
 
@@ -272,21 +306,6 @@ impl Scalar for Topic {
 
     fn schema() -> Json {
         json!({"type": "string", "pattern": "^[^$+#/\\s][^+#/\\s]*(/[^+#/\\s]+)*$"})
-    }
-}
-
-/// The key `tls`, which says what this version cannot do.
-#[derive(Clone, Debug)]
-pub struct NoTls;
-
-impl Read for NoTls {
-    fn read(node: &Node, faults: &mut Faults) -> Option<NoTls> {
-        faults.add(node.named_at(), "this version does not have TLS; remove `tls` and use a `mqtt://` URL");
-        None
-    }
-
-    fn schema(_: &mut Definitions) -> Json {
-        json!(false)
     }
 }
 

@@ -67,6 +67,8 @@ impl GatewayReport {
                 "connected": self.broker.connected,
                 "reason": self.broker.reason,
                 "connects": self.broker.connects,
+                "client_id_taken": self.broker.client_id_taken,
+                "waiting": self.broker.waiting,
                 "dropped": self.broker.dropped,
             },
         })

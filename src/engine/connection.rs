@@ -1,0 +1,267 @@
+//! What is known of the connection to the broker: when to try again after a loss, whether somebody else
+//! takes our place again and again, and how old a message may be that has just arrived.
+
+use crate::engine::time::{Duration, Time};
+
+/// Pauses between attempts begin here and double.
+const PAUSE_FIRST: Duration = Duration::from_millis(500);
+const PAUSE_LAST: Duration = Duration::from_secs(30);
+
+/// A connection that held this long was a good one: after it the pauses begin anew.
+const GOOD_AFTER: Duration = Duration::from_secs(10);
+
+/// The same for a place that somebody else wants: two gateways that give way to each other shall not
+/// take the other's pause for a good connection.
+const PAUSE_LAST_CONTESTED: Duration = Duration::from_secs(120);
+const GOOD_AFTER_CONTESTED: Duration = Duration::from_secs(300);
+
+/// A broker that accepts us at once and closes the connection this soon, this often in a row, most likely
+/// does so for the sake of another client with our identifier: MQTT 3.1.1 has no words for the reason. One
+/// that is restarted is away for a while, or is not restarted so often.
+const THROWN_OUT_WITHIN: Duration = Duration::from_secs(30);
+const THROWN_OUT_TIMES: u32 = 4;
+
+/// A broker that leaves a question unanswered for so long was stalled, or the way to it was.
+const STALLED_AFTER: Duration = Duration::from_secs(3);
+
+/// What others had to say during a stall arrives within this time after it.
+const STALE_UNTIL_AFTER: Duration = Duration::from_millis(500);
+
+/// After a silence that ended the connection, others have said what they had to say within this time.
+const LISTEN_AFTER_SILENCE: Duration = Duration::from_secs(1);
+
+/// How a connection, or an attempt to make one, ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Loss {
+    /// The broker closed it.
+    Closed,
+    /// Nothing came within a time limit.
+    Silent,
+    /// Anything else: refused, unreachable, not understood.
+    Failed,
+}
+
+/// The connection to one broker. Told what happens in the order in which it happens.
+#[derive(Clone, Debug, Default)]
+pub struct Connection {
+    /// When it was made, while it is there.
+    since: Option<Time>,
+    /// Attempts that came to nothing, or to little, since the last good connection.
+    attempts: u32,
+    /// Attempts since the connection was lost.
+    attempts_since_loss: u32,
+    /// How often in a row the broker has accepted us and then closed the connection.
+    thrown_out: u32,
+    contested: bool,
+    /// The oldest question that nothing has come after.
+    asked_at: Option<Time>,
+    /// The broker did not say that it is away, and may hold what others have told it meanwhile.
+    was_silent: bool,
+    /// Until when what arrives may come from a stall, and when that began.
+    stale: Option<(Time, Time)>,
+}
+
+impl Connection {
+    /// The broker has accepted us. Tells how long to wait before listening: a broker that comes back
+    /// from a stall hands on what was sent to it before.
+    pub fn made(&mut self, now: Time) -> Duration {
+        self.since = Some(now);
+        self.attempts_since_loss += 1;
+        self.asked_at = None;
+        let was_silent = std::mem::take(&mut self.was_silent);
+        if was_silent { LISTEN_AFTER_SILENCE } else { Duration::ZERO }
+    }
+
+    /// Something was sent that the broker answers.
+    pub fn asked(&mut self, now: Time) {
+        self.asked_at.get_or_insert(now);
+    }
+
+    /// Anything has come from the broker.
+    pub fn heard(&mut self, now: Time) {
+        if let Some(asked_at) = self.asked_at.take().filter(|asked_at| now - *asked_at >= STALLED_AFTER) {
+            self.stale = Some((now + STALE_UNTIL_AFTER, asked_at));
+        }
+    }
+
+    /// How old a message may be that comes from somebody else and has arrived just now, if that is
+    /// more than the usual.
+    pub fn stale_for(&self, now: Time) -> Option<Duration> {
+        let (_, since) = self.stale.filter(|(until, _)| now < *until)?;
+        Some(now - since)
+    }
+
+    /// It is lost, or could not be made. Tells how long to wait before the next attempt; `seed` is any
+    /// number that varies, so that many gateways do not come back to a restarted broker in the same
+    /// moment.
+    pub fn lost(&mut self, now: Time, loss: Loss, seed: u64) -> Duration {
+        let held = self.since.take().map(|since| now - since);
+        match (held, loss) {
+            (Some(held), Loss::Closed) if self.thrown_out > 0 && held < THROWN_OUT_WITHIN => {
+                self.thrown_out = if self.attempts_since_loss == 1 { self.thrown_out + 1 } else { 1 };
+            }
+            (Some(_), Loss::Closed) => self.thrown_out = 1,
+            (Some(_), Loss::Silent | Loss::Failed) => self.thrown_out = 0,
+            (None, _) => self.attempts_since_loss += 1,
+        }
+        if held.is_some() {
+            self.attempts_since_loss = 0;
+        }
+        if held.is_some_and(|held| held >= self.good_after()) {
+            (self.attempts, self.contested) = (0, false);
+        }
+        self.contested |= self.thrown_out >= THROWN_OUT_TIMES;
+        self.was_silent = loss == Loss::Silent;
+        (self.asked_at, self.stale) = (None, None);
+        let pause = pause(self.attempts, self.contested, seed);
+        self.attempts += 1;
+        pause
+    }
+
+    /// Whether the broker has accepted us and not gone since.
+    pub fn is_made(&self) -> bool {
+        self.since.is_some()
+    }
+
+    /// Whether another client with our identifier takes our place again and again.
+    pub fn is_contested(&self, now: Time) -> bool {
+        let is_good = self.since.is_some_and(|since| now - since >= self.good_after());
+        self.contested && !is_good
+    }
+
+    fn good_after(&self) -> Duration {
+        if self.contested { GOOD_AFTER_CONTESTED } else { GOOD_AFTER }
+    }
+}
+
+/// Doubles with each attempt up to a bound, and varies by a quarter.
+fn pause(attempts: u32, contested: bool, seed: u64) -> Duration {
+    let last = if contested { PAUSE_LAST_CONTESTED } else { PAUSE_LAST };
+    let full = PAUSE_FIRST.saturating_mul(1 << attempts.min(10)).min(last);
+    // The middle of a product with a large odd number is as good as random.
+    let spread = (seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as u32 % 256;
+    full - full / 4 * spread / 256
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(seconds: u64) -> Time {
+        Time::from_millis(seconds * 1000)
+    }
+
+    #[test]
+    fn the_pause_between_attempts_grows_to_a_bound_and_varies() {
+        for (attempts, contested, longest) in [
+            (0, false, 500),
+            (1, false, 1000),
+            (2, false, 2000),
+            (6, false, 30_000),
+            (40, false, 30_000),
+            (2, true, 2000),
+            (40, true, 120_000),
+        ] {
+            let pauses: Vec<Duration> =
+                (0..100).map(|seed| pause(attempts, contested, seed * 1017)).collect();
+            let longest = Duration::from_millis(longest);
+            assert!(pauses.iter().all(|pause| *pause <= longest && *pause >= longest * 3 / 4), "{pauses:?}");
+            assert!(pauses.iter().min() != pauses.iter().max());
+        }
+    }
+
+    #[test]
+    fn after_a_good_connection_the_pauses_begin_anew_and_after_a_short_one_they_grow() {
+        for (held, expected) in [(9, 2000), (10, 500)] {
+            let mut connection = Connection::default();
+            connection.lost(at(0), Loss::Failed, 0);
+            connection.lost(at(1), Loss::Failed, 0);
+            connection.made(at(2));
+            let pause = connection.lost(at(2 + held), Loss::Failed, 0);
+            assert_eq!(pause, Duration::from_millis(expected), "held {held} s");
+        }
+    }
+
+    /// `held`: how long each connection was, in seconds, with the broker reachable at once or only at
+    /// the second attempt.
+    fn check_contested(losses: &[(u64, Loss, bool)], expected: bool) {
+        let (mut connection, mut now) = (Connection::default(), 0);
+        for (held, loss, at_once) in losses {
+            if !at_once {
+                connection.lost(at(now), Loss::Failed, 0);
+            }
+            connection.made(at(now));
+            now += held;
+            connection.lost(at(now), *loss, 0);
+            now += 1;
+        }
+        assert_eq!(connection.is_contested(at(now)), expected, "{losses:?}");
+    }
+
+    #[test]
+    fn a_place_is_contested_when_the_broker_gives_it_away_again_and_again() {
+        let thrown_out = (1, Loss::Closed, true);
+        let after_long = (86_400, Loss::Closed, true);
+        check_contested(&[after_long, thrown_out, thrown_out, thrown_out], true);
+        check_contested(&[after_long, thrown_out, thrown_out], false);
+        // A broker that is restarted three times is away meanwhile.
+        let restarted = (1, Loss::Closed, false);
+        check_contested(&[restarted, restarted, restarted, restarted, thrown_out], false);
+        check_contested(&[thrown_out, thrown_out, thrown_out, (31, Loss::Closed, true)], false);
+        check_contested(&[thrown_out, thrown_out, thrown_out, (1, Loss::Silent, true), thrown_out], false);
+    }
+
+    #[test]
+    fn a_contested_place_is_given_up_for_longer_until_it_is_kept_for_long() {
+        let mut connection = Connection::default();
+        let (mut now, mut pauses) = (0, Vec::new());
+        for _ in 0..10 {
+            connection.made(at(now));
+            pauses.push(connection.lost(at(now + 20), Loss::Closed, 0).as_secs());
+            now += 30;
+        }
+        // The first few may have been anything.
+        assert_eq!(pauses, [0, 0, 0, 0, 1, 2, 4, 8, 16, 32]);
+        connection.made(at(now));
+        assert!(connection.is_contested(at(now + 299)));
+        assert!(!connection.is_contested(at(now + 300)));
+        assert_eq!(connection.lost(at(now + 300), Loss::Closed, 0), PAUSE_FIRST);
+        assert!(!connection.is_contested(at(now + 301)));
+    }
+
+    #[test]
+    fn what_comes_after_a_silence_may_be_as_old_as_the_silence() {
+        let mut connection = Connection::default();
+        connection.made(at(0));
+        connection.asked(at(10));
+        connection.asked(at(14));
+        assert_eq!(connection.stale_for(at(12)), None, "nothing has arrived");
+        connection.heard(at(16));
+        assert_eq!(connection.stale_for(at(16)), Some(Duration::from_secs(6)));
+        assert_eq!(connection.stale_for(at(17)), None);
+        connection.asked(at(20));
+        connection.heard(at(22));
+        assert_eq!(connection.stale_for(at(22)), None, "two seconds are no stall");
+    }
+
+    #[test]
+    fn after_a_silence_that_ended_the_connection_one_listens_a_little_later() {
+        let second = Duration::from_secs(1);
+        for (losses, expected) in [
+            (&[][..], Duration::ZERO),
+            (&[Loss::Silent], second),
+            (&[Loss::Closed], Duration::ZERO),
+            (&[Loss::Failed, Loss::Silent, Loss::Silent], second),
+            // A broker that was away holds nothing.
+            (&[Loss::Silent, Loss::Failed], Duration::ZERO),
+        ] {
+            let mut connection = Connection::default();
+            connection.made(at(0));
+            for loss in losses {
+                connection.lost(at(30), *loss, 0);
+            }
+            assert_eq!(connection.made(at(60)), expected, "{losses:?}");
+            assert_eq!(connection.made(at(61)), Duration::ZERO, "once");
+        }
+    }
+}
