@@ -1,6 +1,10 @@
 //! The whole program between simulated devices and a real broker.
 
+mod faults;
+mod neighbours;
+mod proxy;
 mod rig;
+mod secure;
 mod watching;
 
 use std::collections::BTreeSet;

@@ -1,8 +1,8 @@
 //! What each test needs: a real mosquitto, the built program, and somebody who watches the topics.
 
 use std::fs;
-use std::io::{BufRead, BufReader};
-use std::net::TcpListener;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -18,9 +18,10 @@ use tempfile::TempDir;
 /// No event takes this long unless it never comes.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// A mosquitto on a port of its own, that forgets everything when it ends.
+/// A mosquitto on a port of its own, that forgets everything when it ends unless it is told to persist.
 pub struct Broker {
     pub port: u16,
+    address: &'static str,
     folder: TempDir,
     extra: String,
     child: Option<Child>,
@@ -28,20 +29,30 @@ pub struct Broker {
 
 impl Broker {
     pub fn start() -> Broker {
-        Broker::start_with("allow_anonymous true\n")
+        Broker::start_with("allow_anonymous true\npersistence false\n")
+    }
+
+    /// It remembers what is retained, and sessions, over its own end.
+    pub fn start_persistent() -> Broker {
+        Broker::start_with("allow_anonymous true\npersistence true\nautosave_interval 1\n")
     }
 
     /// `extra` are lines of its configuration.
     pub fn start_with(extra: &str) -> Broker {
         // Somebody else may take the port between our look and mosquitto's.
         for _ in 0..10 {
-            let folder = tempfile::tempdir().expect("a folder");
-            let mut broker = Broker { port: free_port(), folder, extra: extra.into(), child: None };
-            if broker.launch() {
+            if let Some(broker) = Broker::try_at("127.0.0.1", free_port(), extra) {
                 return broker;
             }
         }
         panic!("mosquitto does not start");
+    }
+
+    /// `None` if there is no such address, or the port is taken.
+    pub fn try_at(address: &'static str, port: u16, extra: &str) -> Option<Broker> {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut broker = Broker { port, address, folder, extra: extra.into(), child: None };
+        broker.launch().then_some(broker)
     }
 
     /// As if its machine lost power.
@@ -52,15 +63,52 @@ impl Broker {
         }
     }
 
-    /// Again on the same port, with nothing remembered.
+    /// Asks it to end; it writes down what it shall remember.
+    pub fn stop(&mut self) {
+        self.signal(Signal::TERM);
+        if let Some(mut child) = self.child.take() {
+            child.wait().expect("mosquitto has ended");
+        }
+    }
+
+    /// It runs no longer and has not ended, like a machine that swaps.
+    pub fn stall(&self) {
+        self.signal(Signal::STOP);
+    }
+
+    /// The end of [`Broker::stall`].
+    pub fn go_on(&self) {
+        self.signal(Signal::CONT);
+    }
+
+    fn signal(&self, signal: Signal) {
+        if let Some(child) = &self.child {
+            kill_process(Pid::from_child(child), signal).expect("the signal is sent");
+        }
+    }
+
+    /// Again on the same port, with what it remembers.
     pub fn restart(&mut self) {
         self.kill();
+        self.start_again();
+    }
+
+    /// The same after its end.
+    pub fn start_again(&mut self) {
         assert!(self.launch(), "mosquitto starts again on port {}", self.port);
     }
 
     fn launch(&mut self) -> bool {
-        let file = self.folder.path().join("mosquitto.conf");
-        let text = format!("listener {} 127.0.0.1\npersistence false\n{}", self.port, self.extra);
+        let folder = self.folder.path();
+        let file = folder.join("mosquitto.conf");
+        // Started by root it would become another user, who may not read what tests write.
+        let text = format!(
+            "listener {} {}\nuser root\npersistence_location {}/\n{}",
+            self.port,
+            self.address,
+            folder.display(),
+            self.extra
+        );
         fs::write(&file, text).expect("its configuration is written");
         let program = ["/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto", "/opt/homebrew/sbin/mosquitto"]
             .into_iter()
@@ -76,7 +124,7 @@ impl Broker {
             .expect("mosquitto is installed: it is in the Debian package `mosquitto`");
         let started = eventually(|| {
             let ended = child.try_wait().expect("its state is known").is_some();
-            let listens = std::net::TcpStream::connect(("127.0.0.1", self.port)).is_ok();
+            let listens = TcpStream::connect((self.address, self.port)).is_ok();
             (ended || listens).then_some(!ended)
         });
         self.child = Some(child);
@@ -94,7 +142,7 @@ impl Drop for Broker {
     }
 }
 
-fn free_port() -> u16 {
+pub fn free_port() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
     listener.local_addr().expect("its address").port()
 }
@@ -145,11 +193,17 @@ impl Gateway {
                 lines.1.notify_all();
             }
         });
-        let mut gateway = Gateway { child, log, http: String::new(), _folder: folder };
+        let gateway = Gateway { child, log, http: String::new(), _folder: folder };
+        gateway.listening()
+    }
+
+    /// Waits until it has told where it listens.
+    fn listening(mut self) -> Gateway {
+        let gateway = &mut self;
         let line = gateway.wait_for_log("HTTP on http://");
         let address = line.split("http://").nth(1).and_then(|rest| rest.split('/').next());
         gateway.http = format!("http://{}", address.expect("the line names the address"));
-        gateway
+        self
     }
 
     /// The first line of the log that contains `part`; waits for it.
@@ -188,6 +242,24 @@ impl Gateway {
         assert!(seen.is_some(), "/health is {:?}, not {status}", self.get("/health"));
     }
 
+    /// The memory that it occupies, in bytes.
+    pub fn resident(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("it runs");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("Linux tells it");
+        let kilobytes = line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number");
+        kilobytes * 1024
+    }
+
+    /// It runs no longer and has not ended.
+    pub fn stall(&self) {
+        kill_process(Pid::from_child(&self.child), Signal::STOP).expect("the signal is sent");
+    }
+
+    /// The end of [`Gateway::stall`].
+    pub fn go_on(&self) {
+        kill_process(Pid::from_child(&self.child), Signal::CONT).expect("the signal is sent");
+    }
+
     /// Asks it to end, and waits until it has.
     pub fn terminate(mut self) -> ExitStatus {
         let pid = Pid::from_child(&self.child);
@@ -208,6 +280,47 @@ impl Drop for Gateway {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// Connects as `client_id` with a session that the broker shall keep, subscribes, and goes.
+pub fn leave_a_session(broker: &Broker, client_id: &str, filter: &str) {
+    let mut options = MqttOptions::new(client_id, broker.address, broker.port);
+    options.set_clean_session(false);
+    let (client, mut connection) = Client::new(options, 10);
+    client.subscribe(filter, QoS::AtLeastOnce).expect("there is room");
+    for event in connection.iter() {
+        match event.expect("the broker is there") {
+            Event::Incoming(Packet::SubAck(_)) => client.disconnect().expect("there is room"),
+            Event::Outgoing(rumqttc::Outgoing::Disconnect) => return,
+            _ => {}
+        }
+    }
+}
+
+/// Comes to a broker that does not answer yet, and publishes as soon as it is let in. By hand, since a
+/// client library would not wait here until it stands in the broker's queue.
+pub fn queue_up(broker: &Broker, topic: &str, payload: &str) -> thread::JoinHandle<()> {
+    let mut stream = TcpStream::connect((broker.address, broker.port)).expect("the system takes it");
+    // CONNECT: MQTT 3.1.1, a clean session, a minute's keep-alive, the identifier `late`.
+    let connect = [b"\x10\x10\0\x04MQTT\x04\x02\0\x3c\0\x04late".as_slice()].concat();
+    stream.write_all(&connect).expect("the system takes it");
+    let length = u8::try_from(2 + topic.len() + payload.len()).expect("a short message");
+    let publish = [&[0x30, length, 0, topic.len() as u8], topic.as_bytes(), payload.as_bytes()].concat();
+    thread::spawn(move || {
+        let mut let_in = [0; 4];
+        stream.read_exact(&mut let_in).expect("the broker lets it in");
+        stream.write_all(&publish).expect("it is published");
+    })
+}
+
+/// Ends a verb of the program: whether it is content, and what it says on standard error.
+pub fn busker(arguments: &[&str], environment: &[(&str, &str)]) -> (Option<i32>, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_busker"))
+        .args(arguments)
+        .envs(environment.iter().copied())
+        .output()
+        .expect("busker starts");
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
 }
 
 /// One message as somebody else received it.
@@ -233,7 +346,7 @@ impl Watcher {
     }
 
     pub fn start_as(broker: &Broker, name: &str, user: Option<(&str, &str)>) -> Watcher {
-        let mut options = MqttOptions::new(name, "127.0.0.1", broker.port);
+        let mut options = MqttOptions::new(name, broker.address, broker.port);
         options.set_max_packet_size(1 << 24, 1 << 24);
         if let Some((user, password)) = user {
             options.set_credentials(user, password);

@@ -1,0 +1,89 @@
+//! Several gateways on one broker: of two names, and of one.
+
+use serde_json::Value as Json;
+
+use super::rig::{self, Broker, Gateway, Received, Watcher};
+use super::{configuration, json, over_tcp, relay, remembered, simulation};
+
+fn health(gateway: &Gateway) -> Json {
+    json(&gateway.get("/health").1)
+}
+
+#[test]
+fn two_gateways_with_two_base_topics_leave_each_other_alone() {
+    let broker = Broker::start();
+    let simulations = [simulation(), simulation()];
+    let ports = simulations.each_ref().map(over_tcp);
+    let watcher = Watcher::start(&broker, "watcher");
+    // One name begins like the other.
+    let bases = ["busker", "busker_2"];
+    let start = |index: usize| {
+        Gateway::start_with(&format!(
+            "mqtt: {{url: 'mqtt://127.0.0.1:{}', base_topic: {}}}\n{}",
+            broker.port,
+            bases[index],
+            configuration(&ports[index])
+        ))
+    };
+    let gateways = [start(0), start(1)];
+    for base in bases {
+        for topic in ["bridge/state", "relays/availability", "counters/availability"] {
+            watcher.wait_for(&format!("{base}/{topic}"), "online");
+        }
+    }
+    watcher.publish("busker_2/relays/relay_2/set", "ON");
+    watcher.wait_until("an outcome", |got| got.topic == "busker_2/relays/relay_2/outcome");
+    assert_eq!(simulations.each_ref().map(|simulation| relay(simulation, 2)), ["OFF", "ON"]);
+
+    // Each comes back and finds the other's announcements.
+    let [first, second] = gateways;
+    assert!(first.terminate().success());
+    let first = start(0);
+    first.wait_for_health(200);
+    watcher.wait_for("busker/bridge/state", "online");
+    for gateway in [&first, &second] {
+        let health = health(gateway);
+        assert_eq!(health["broker"]["connects"], 1, "{health}");
+        assert_eq!(health["broker"]["client_id_taken"], false, "{health}");
+    }
+    let all = remembered(&broker, "newcomer");
+    for base in bases {
+        for device in ["bridge", "bus_line", "relays", "counters"] {
+            let topic = format!("homeassistant/device/{base}_{device}/config");
+            let config = json(super::payload(&all, &topic));
+            let is_own = config["device"]["identifiers"][0] == format!("{base}_{device}");
+            assert!(is_own, "{topic}: {config}");
+        }
+    }
+}
+
+#[test]
+fn a_client_identifier_that_is_taken_is_told_once_and_the_pauses_grow() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let watcher = Watcher::start(&broker, "watcher");
+    let first = Gateway::start(&broker, &configuration(&port));
+    super::wait_until_all_is_online(&watcher);
+    let second = Gateway::start(&broker, &configuration(&port));
+    let is_contested = |gateway: &Gateway| health(gateway)["broker"]["client_id_taken"] == true;
+    rig::eventually(|| (is_contested(&first) || is_contested(&second)).then_some(())).expect("it is noticed");
+    let (contested, other) = if is_contested(&first) { (first, second) } else { (second, first) };
+    let said = "another client has the identifier `busker_gateway`";
+    contested.wait_for_log(said);
+    assert_ne!(health(&contested)["status"], "ok");
+    // It is told to whoever watches the broker, too, when it is this one's turn.
+    watcher.wait_until("health", |got: &Received| {
+        got.topic == "busker/bridge/health" && json(&got.payload)["broker"]["client_id_taken"] == true
+    });
+    assert!(health(&contested)["broker"]["connects"].as_u64() < Some(10));
+
+    // When the other one goes, all is well again.
+    other.kill();
+    contested.wait_for_health(200);
+    watcher.forget();
+    watcher.publish("busker/relays/relay_2/set", "ON");
+    let outcome = watcher.wait_until("an outcome", |got| got.topic == "busker/relays/relay_2/outcome");
+    assert_eq!(json(&outcome.payload)["outcome"], "done");
+    let times = contested.log().iter().filter(|line| line.contains(said)).count();
+    assert_eq!(times, 1, "{:?}", contested.log());
+}
