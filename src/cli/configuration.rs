@@ -23,11 +23,16 @@ pub struct ConfigurationArgs {
 impl ConfigurationArgs {
     /// The settings; warnings are told on standard error.
     pub fn load(&self) -> Result<Settings, Failure> {
+        self.load_with_library().map(|loaded| loaded.settings)
+    }
+
+    /// The same with the profiles that were known.
+    pub fn load_with_library(&self) -> Result<Loaded, Failure> {
         let loaded = load(&self.config)?.map_err(faults)?;
         for warning in &loaded.warnings {
             eprintln!("warning: {}: {}", warning.place, warning.message);
         }
-        Ok(loaded.settings)
+        Ok(loaded)
     }
 }
 

@@ -1,6 +1,6 @@
 //! `busker run`: the service.
 
-use super::configuration::ConfigurationArgs;
+use super::configuration::{ConfigurationArgs, Loaded};
 use super::{Failure, log};
 use crate::edge::app::App;
 use crate::edge::shutdown;
@@ -22,14 +22,15 @@ pub struct Args {
 
 pub fn run(args: Args) -> Result<(), Failure> {
     log::start();
-    let mut settings = args.configuration.load().map_err(|failure| failure.so("nothing was started"))?;
+    let loaded = args.configuration.load_with_library();
+    let Loaded { mut settings, library, .. } = loaded.map_err(|failure| failure.so("nothing was started"))?;
     if args.http.is_some() {
         settings.http.listen = args.http;
     }
     let (buses, devices) = (settings.buses.len(), settings.devices.len());
     let names = settings.devices.iter().map(|device| device.name.as_str());
     let state = StateFiles::open(&settings.state_dir, names)?;
-    let app = App::start(settings, state)?;
+    let app = App::start(settings, library, state)?;
     if let Some(address) = app.http_address() {
         tracing::info!("HTTP on http://{address}/health");
     }

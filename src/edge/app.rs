@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::Context;
 use tokio::runtime::Runtime;
@@ -22,6 +22,8 @@ use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::health::{self, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
 use crate::engine::outbox::Outbox;
+use crate::engine::profile::Library;
+use crate::engine::request::{Decision, Desk};
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 use crate::engine::topics::{Message, Topics};
@@ -46,9 +48,10 @@ pub struct App {
 }
 
 impl App {
-    /// Starts everything, going on from what is remembered in `state`. An error means that nothing is left
+    /// Starts everything, going on from what is remembered in `state`. By `library` a scan
+    /// knows devices. An error means that nothing is left
     /// running.
-    pub fn start(settings: Settings, state: StateFiles) -> anyhow::Result<App> {
+    pub fn start(settings: Settings, library: Library, state: StateFiles) -> anyhow::Result<App> {
         let password = files::read_secret("password", &settings.mqtt.password)?;
         let token = files::read_token(&settings.http.token)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -73,7 +76,8 @@ impl App {
         let buses = Arc::new(start_buses(&settings, clock, &state, &mailbox)?);
 
         let _inside = runtime.enter();
-        let route = Route::new(&settings, topics.clone(), buses.clone(), mailbox.clone());
+        let desk = Desk::new(&settings, library);
+        let route = Route::new(&settings, desk, clock, buses.clone(), mailbox.clone());
         let broker = Broker::start(&settings, password, clock, mailbox.clone(), move |news| route.tell(news));
         let memories = state.memories();
         let first = (0..buses.len())
@@ -184,14 +188,23 @@ struct Route {
     /// Device to bus.
     bus_of: BTreeMap<String, usize>,
     topics: Topics,
+    desk: Mutex<Desk>,
+    clock: Clock,
     buses: Arc<Vec<BusHandle>>,
     mailbox: Arc<Mailbox>,
 }
 
 impl Route {
-    fn new(settings: &Settings, topics: Topics, buses: Arc<Vec<BusHandle>>, mailbox: Arc<Mailbox>) -> Route {
+    fn new(
+        settings: &Settings,
+        desk: Desk,
+        clock: Clock,
+        buses: Arc<Vec<BusHandle>>,
+        mailbox: Arc<Mailbox>,
+    ) -> Route {
+        let topics = Topics::new(&settings.mqtt.base_topic);
         let bus_of = settings.devices.iter().map(|device| (device.name.clone(), device.bus)).collect();
-        Route { bus_of, topics, buses, mailbox }
+        Route { bus_of, topics, desk: Mutex::new(desk), clock, buses, mailbox }
     }
 
     fn tell(&self, news: News) {
@@ -201,6 +214,7 @@ impl Route {
             News::Get { device, point } => {
                 self.tell_bus_of(&device.clone(), Event::Get { device, point });
             }
+            News::Request { verb, payload, retained } => self.request(&verb, &payload, retained),
             News::Set { device, point, payload, retained } => {
                 let refused = Outcome::new(OutcomeKind::Refused, &payload, "too many commands wait");
                 let topic = self.topics.outcome(&device, &point);
@@ -209,6 +223,20 @@ impl Route {
                     self.mailbox.push(Message::once(topic, refused.to_json()));
                 }
             }
+        }
+    }
+
+    fn request(&self, verb: &str, payload: &str, retained: bool) {
+        let mut desk = self.desk.lock().unwrap_or_else(PoisonError::into_inner);
+        match desk.take(self.clock.today(), verb, payload, retained) {
+            Decision::Ask(bus, request) => {
+                if self.buses[bus].send(Event::Request(request.clone())).is_err() {
+                    self.mailbox.push(request.refusal(&self.topics, "too much waits for the bus"));
+                }
+            }
+            Decision::Answer(message) => self.mailbox.push(message),
+            Decision::Warn(text) => tracing::warn!("{text}"),
+            Decision::Ignore => {}
         }
     }
 

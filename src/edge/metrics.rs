@@ -121,6 +121,7 @@ mod tests {
             line: None,
             up: true,
             reason: None,
+            paused: false,
             counters: Counters { requests: 12, ..Counters::default() },
             load: 0.25,
             devices: vec![device],

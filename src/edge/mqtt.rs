@@ -67,6 +67,7 @@ pub enum News {
     Down,
     Set { device: String, point: String, payload: String, retained: bool },
     Get { device: String, point: String },
+    Request { verb: String, payload: String, retained: bool },
 }
 
 /// How the connection is, for whoever wants to tell.
@@ -343,7 +344,10 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             Some(Incoming::Get { device, point }) if !retained => {
                 (self.tell)(News::Get { device: device.to_string(), point: point.to_string() });
             }
-            Some(Incoming::Get { .. } | Incoming::Request { .. }) | None => {}
+            Some(Incoming::Request { verb }) => {
+                (self.tell)(News::Request { verb: verb.to_string(), payload, retained });
+            }
+            Some(Incoming::Get { .. }) | None => {}
         }
     }
 

@@ -62,6 +62,7 @@ mod tests {
             line: None,
             up: true,
             reason: None,
+            paused: false,
             counters: Counters { requests, ..Counters::default() },
             load: 0.0,
             devices: Vec::new(),

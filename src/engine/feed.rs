@@ -149,6 +149,7 @@ mod tests {
             line: None,
             up: true,
             reason: None,
+            paused: false,
             counters: Counters::default(),
             load: 0.1,
             devices: vec![device],

@@ -84,6 +84,8 @@ pub struct BusReport {
     pub up: bool,
     /// Why the link is down.
     pub reason: Option<String>,
+    /// It is down because somebody wants it so, for a time.
+    pub paused: bool,
     pub counters: Counters,
     /// The share of the last minute in which the wire was busy, 0 to 1.
     pub load: f64,
@@ -289,7 +291,7 @@ impl BusHealth {
     /// Nothing on this bus can be reached. One dead device is no lost bus, even if it is the only one.
     fn is_lost(&self) -> bool {
         let devices = &self.report.devices;
-        !self.report.up || (devices.len() > 1 && devices.iter().all(|device| !device.online))
+        !self.report.paused && (!self.report.up || (devices.len() > 1 && devices.iter().all(|device| !device.online)))
     }
 }
 
@@ -317,7 +319,7 @@ impl GatewayReport {
         let mut devices = self.buses.iter().flat_map(|bus| &bus.report.devices);
         if !self.broker.connected || self.buses.iter().any(|bus| bus.is_lost() || !bus.responding) {
             Status::Lost
-        } else if devices.any(|device| !device.online) {
+        } else if devices.any(|device| !device.online) || self.buses.iter().any(|bus| bus.report.paused) {
             Status::Degraded
         } else {
             Status::Ok
@@ -375,6 +377,7 @@ mod tests {
             line: None,
             up,
             reason: None,
+            paused: false,
             counters: Counters::default(),
             load: 0.123_456,
             devices: devices.collect(),

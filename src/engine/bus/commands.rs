@@ -65,6 +65,7 @@ impl Bus {
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
         self.end_settling("written, but not read back: busker stops");
+        self.refuse_requests();
         if self.in_flight.is_none() {
             for device in &mut self.devices {
                 device.say_offline(&mut self.context);

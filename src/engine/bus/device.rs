@@ -6,6 +6,7 @@ mod keeping;
 mod obeying;
 mod patience;
 mod reporting;
+mod requested;
 mod telling;
 mod wear;
 
@@ -320,7 +321,7 @@ impl DeviceState {
         self.tell_info(context);
     }
 
-    fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
+    pub(super) fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         self.patience.unanswered();
         self.paused_until = now + self.patience.pause(self.asked_timeout, self.settings.unit);
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {

@@ -10,6 +10,7 @@ mod words;
 
 use std::path::PathBuf;
 
+use crate::engine::address::Span;
 use crate::engine::configuration::file::Configuration;
 use crate::engine::configuration::words::{HostPort, Listen, Name, Part, Unit};
 use crate::engine::device::Device;
@@ -318,6 +319,7 @@ impl Resolver<'_> {
             if let (Some(bus), Some(unit), Some(resolved)) = (bus, device.unit.get(), self.device(device)) {
                 let settings = read_part(&device.settings);
                 let wanted = settings.map(|settings| wanted::check(settings, &resolved, &mut self.faults));
+                let raw_write = device.raw_write.get().map(|spans| self.raw_write(spans, &resolved));
                 devices.push(DeviceSettings {
                     name: name.0.clone(),
                     title: device.name.clone().unwrap_or_else(|| title(&name.0)),
@@ -325,10 +327,32 @@ impl Resolver<'_> {
                     unit: unit.value.0,
                     device: resolved,
                     wanted: wanted.unwrap_or_default(),
+                    raw_write: raw_write.unwrap_or_default(),
                 });
             }
         }
         devices
+    }
+
+    /// What may be written as it is lies in a table that can be written, and touches nothing forbidden.
+    fn raw_write(&mut self, spans: &[At<Span>], device: &Device) -> Vec<Span> {
+        for span in spans {
+            if !span.table().is_writable() {
+                self.faults.add(
+                    &span.place,
+                    format!("`{}` can only be read; expected spans of `coil` or `holding`", span.value),
+                );
+            }
+            if let Some(forbidden) = device.wire.forbidden.iter().find(|other| other.span.overlaps(span.value))
+            {
+                let (found, inside, reason) = (span.value, forbidden.span, &forbidden.reason);
+                let message = format!(
+                    "`{found}` touches `{inside}`, which the profile forbids ({reason}); leave it out"
+                );
+                self.faults.add(&span.place, message);
+            }
+        }
+        spans.iter().map(|span| span.value).collect()
     }
 
     fn device_name(&mut self, name: &At<Name>, file: &Configuration) {

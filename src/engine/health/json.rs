@@ -110,6 +110,7 @@ fn bus_json(bus: &BusHealth) -> Value {
         "line": report.line,
         "up": report.up,
         "reason": report.reason,
+        "paused": report.paused,
         "responding": bus.responding,
         "load": (report.load * 1000.0).round() / 1000.0,
     }));
