@@ -291,7 +291,8 @@ impl BusHealth {
     /// Nothing on this bus can be reached. One dead device is no lost bus, even if it is the only one.
     fn is_lost(&self) -> bool {
         let devices = &self.report.devices;
-        !self.report.paused && (!self.report.up || (devices.len() > 1 && devices.iter().all(|device| !device.online)))
+        !self.report.paused
+            && (!self.report.up || (devices.len() > 1 && devices.iter().all(|device| !device.online)))
     }
 }
 

@@ -33,15 +33,8 @@ pub enum Verb {
 }
 
 impl Verb {
-    const ALL: [Verb; 7] = [
-        Verb::Read,
-        Verb::Write,
-        Verb::Identify,
-        Verb::Diagnostics,
-        Verb::Scan,
-        Verb::Refresh,
-        Verb::Pause,
-    ];
+    const ALL: [Verb; 7] =
+        [Verb::Read, Verb::Write, Verb::Identify, Verb::Diagnostics, Verb::Scan, Verb::Refresh, Verb::Pause];
 
     pub const fn name(self) -> &'static str {
         match self {
@@ -228,14 +221,7 @@ impl Desk {
             Ok((bus, verb, wish)) => Decision::Ask(bus, Request { verb, transaction, wish }),
             Err(error) => {
                 let error = Some(error.as_str());
-                Decision::Answer(answer(
-                    &self.topics,
-                    verb,
-                    &transaction,
-                    Status::Error,
-                    Json::Null,
-                    error,
-                ))
+                Decision::Answer(answer(&self.topics, verb, &transaction, Status::Error, Json::Null, error))
             }
         }
     }
@@ -274,7 +260,9 @@ impl Desk {
                     (None, Some(_)) => self.device(&object)?.1,
                     (None, None) => return Err(object.missing("bus")),
                     (Some(_), Some(_)) => {
-                        return Err("`bus` and `device` stand beside each other; leave one of them out".into());
+                        return Err(
+                            "`bus` and `device` stand beside each other; leave one of them out".into()
+                        );
                     }
                 };
                 let text = object.text("for")?.ok_or_else(|| object.missing("for"))?;
@@ -367,7 +355,9 @@ impl Object {
         match self.entries.get(key) {
             None => Ok(None),
             Some(Json::String(text)) => Ok(Some(text)),
-            Some(other) => Err(format!("`{key}` is `{other}`; expected a text, as in `{}`", self.verb.example())),
+            Some(other) => {
+                Err(format!("`{key}` is `{other}`; expected a text, as in `{}`", self.verb.example()))
+            }
         }
     }
 
@@ -392,11 +382,15 @@ fn words(span: Span, value: &Json) -> Result<Vec<u16>, String> {
         (true, Json::Bool(on)) => Ok(u16::from(*on)),
         (true, Json::String(text)) if text == "ON" || text == "OFF" => Ok(u16::from(text == "ON")),
         (true, value) if matches!(value.as_u64(), Some(0 | 1)) => Ok(u16::from(value.as_u64() == Some(1))),
-        (true, _) => Err(format!("`{value}` is no coil's value; expected true, false, 0, 1, \"ON\" or \"OFF\"")),
+        (true, _) => {
+            Err(format!("`{value}` is no coil's value; expected true, false, 0, 1, \"ON\" or \"OFF\""))
+        }
         (false, value) => match value.as_i64() {
             // -1 and 65535 are the same word.
             Some(number) if (-32_768..=65_535).contains(&number) => Ok(number as u16),
-            _ => Err(format!("`{value}` is no register's value; expected a whole number from -32768 to 65535")),
+            _ => {
+                Err(format!("`{value}` is no register's value; expected a whole number from -32768 to 65535"))
+            }
         },
     };
     let words: Vec<u16> = match value {
@@ -479,11 +473,7 @@ devices:
         );
         check_error("identify", "7", &format!("this is no JSON object; {like}"));
         check_error("identify", "{}", &format!("`device` is missing; {like}"));
-        check_error(
-            "identify",
-            &" ".repeat(20_000),
-            &format!("20000 bytes are no request; {like}"),
-        );
+        check_error("identify", &" ".repeat(20_000), &format!("20000 bytes are no request; {like}"));
         check_error(
             "identify",
             r#"{"device":7}"#,
@@ -494,7 +484,11 @@ devices:
             r#"{"devise":"relays"}"#,
             "`identify` knows no `devise`; did you mean `device`?",
         );
-        check_error("identify", r#"{"device":"relay"}"#, "there is no device `relay`; did you mean `relays`?");
+        check_error(
+            "identify",
+            r#"{"device":"relay"}"#,
+            "there is no device `relay`; did you mean `relays`?",
+        );
         check_error("scan", r#"{"bus":"roof"}"#, "there is no bus `roof`; expected `basement` or `plant`");
         check_error(
             "scan",

@@ -108,7 +108,10 @@ impl Topics {
 
     /// The filters to subscribe to, so that everything [`Topics::parse`] knows arrives.
     pub fn subscriptions(&self) -> Vec<String> {
-        ["+/+/set", "+/+/get", "bridge/request/+"].iter().map(|tail| format!("{}/{tail}", self.base)).collect()
+        ["+/+/set", "+/+/get", "bridge/request/+"]
+            .iter()
+            .map(|tail| format!("{}/{tail}", self.base))
+            .collect()
     }
 
     /// What a message on `topic` asks for; `None` if it is none of our business.

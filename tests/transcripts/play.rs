@@ -260,9 +260,7 @@ impl Player {
                     objects: objects.map(|(id, name)| (object + id as u8, name.to_string())).collect(),
                 }))
             }
-            ("echo", word) => {
-                Ok(Answer::Diagnostics(vec![u16::from_str_radix(word, 16).expect("a word")]))
-            }
+            ("echo", word) => Ok(Answer::Diagnostics(vec![u16::from_str_radix(word, 16).expect("a word")])),
             ("server-id", byte) => Ok(Answer::ServerId(vec![u8::from_str_radix(byte, 16).expect("a byte")])),
             _ => match words(&request, text) {
                 Some(answer) => Ok(answer),
@@ -309,7 +307,16 @@ impl Player {
                 }
                 Answer::Written
             }
-            other => panic!("devices do not answer {other} by themselves"),
+            Call::WriteRegisters { address, words } => {
+                for (at, word) in (address..).zip(words) {
+                    self.registers.insert((unit, Table::Holding, at), word);
+                }
+                Answer::Written
+            }
+            // They know no other function.
+            Call::ReadIdentification { .. } | Call::ReportServerId | Call::Diagnostics { .. } => {
+                return self.reply(sent_at, Err(RequestError::Exception(1)));
+            }
         };
         self.reply(sent_at, Ok(answer));
     }

@@ -343,7 +343,8 @@ impl Resolver<'_> {
                     format!("`{}` can only be read; expected spans of `coil` or `holding`", span.value),
                 );
             }
-            if let Some(forbidden) = device.wire.forbidden.iter().find(|other| other.span.overlaps(span.value))
+            if let Some(forbidden) =
+                device.wire.forbidden.iter().find(|other| other.span.overlaps(span.value))
             {
                 let (found, inside, reason) = (span.value, forbidden.span, &forbidden.reason);
                 let message = format!(

@@ -106,9 +106,10 @@ impl DeviceState {
 
     fn is_allowed(&self, span: Span) -> Result<(), String> {
         match self.device().wire.forbidden.iter().find(|forbidden| forbidden.span.overlaps(span)) {
-            Some(forbidden) => {
-                Err(format!("`{span}` touches `{}`, which is forbidden: {}", forbidden.span, forbidden.reason))
-            }
+            Some(forbidden) => Err(format!(
+                "`{span}` touches `{}`, which is forbidden: {}",
+                forbidden.span, forbidden.reason
+            )),
             None => Ok(()),
         }
     }
@@ -118,7 +119,8 @@ impl DeviceState {
         for point in self.points_touching(span) {
             let details = self.details(point);
             let written = details.write.as_ref().map(|write| write.at.span);
-            for place in [Some(details.at.span), details.also.map(|also| also.span), written].into_iter().flatten()
+            for place in
+                [Some(details.at.span), details.also.map(|also| also.span), written].into_iter().flatten()
             {
                 let elements = details.plain().map_or(1, |form| u32::from(form.elements).max(1));
                 let width = (place.count() / elements).max(1);
@@ -192,7 +194,9 @@ impl DeviceState {
         let mut readings = Map::new();
         for (index, point) in device.points.iter().enumerate().filter(|(_, point)| !point.is_button()) {
             let places = [Some(point.at), point.also];
-            let Some(at) = places.into_iter().flatten().find(|place| span.contains(place.span)) else { continue };
+            let Some(at) = places.into_iter().flatten().find(|place| span.contains(place.span)) else {
+                continue;
+            };
             let Some(field) = codec::words_at(at, span.first(), words) else { continue };
             let text = match codec::resolve(device, index, self.known()) {
                 Ok(resolved) => codec::read(&resolved, &field).to_string(),
@@ -220,7 +224,9 @@ impl DeviceState {
             }
             None => {
                 (0..self.settings.device.things.len()).for_each(|thing| self.want_thing(thing));
-                (0..self.settings.device.points.len()).filter(|point| self.details(*point).is_read()).collect()
+                (0..self.settings.device.points.len())
+                    .filter(|point| self.details(*point).is_read())
+                    .collect()
             }
         };
         for point in &wanted {

@@ -3,8 +3,8 @@
 use serde_json::{Map, Value as Json, json};
 
 use crate::engine::bus::device::DeviceState;
-use crate::engine::identity;
 use crate::engine::device::Identify;
+use crate::engine::identity;
 use crate::engine::modbus::{self, Answer, Call, RequestError};
 use crate::engine::request::Status;
 
@@ -42,7 +42,10 @@ pub(super) struct Identification {
 
 enum Step {
     /// 1 basic, 2 regular, 3 extended, from this object on.
-    Objects { code: u8, object: u8 },
+    Objects {
+        code: u8,
+        object: u8,
+    },
     ServerId,
     Register,
 }
@@ -64,7 +67,11 @@ impl Identification {
         Progress::Ask(Call::ReadIdentification { code: 1, object: 0 })
     }
 
-    pub(super) fn answered(&mut self, device: &DeviceState, result: Result<Answer, RequestError>) -> Progress {
+    pub(super) fn answered(
+        &mut self,
+        device: &DeviceState,
+        result: Result<Answer, RequestError>,
+    ) -> Progress {
         // A refusal is an answer, silence is not.
         self.heard |= matches!(result, Ok(_) | Err(RequestError::Exception(_)));
         match self.step {
@@ -182,7 +189,11 @@ impl Diagnosis {
         Progress::Ask(Call::Diagnostics { function: 0, data: vec![QUERY] })
     }
 
-    pub(super) fn answered(&mut self, device: &DeviceState, result: Result<Answer, RequestError>) -> Progress {
+    pub(super) fn answered(
+        &mut self,
+        device: &DeviceState,
+        result: Result<Answer, RequestError>,
+    ) -> Progress {
         let silence = match &result {
             Ok(_) | Err(RequestError::Exception(_)) => None,
             Err(error) => Some(error.to_string()),
@@ -204,8 +215,12 @@ impl Diagnosis {
                 Progress::Ask(Call::Diagnostics { function: *function, data: vec![0] })
             }
             None => {
-                let own: Map<String, Json> =
-                    device.counters().list().into_iter().map(|(name, count)| (name.into(), count.into())).collect();
+                let own: Map<String, Json> = device
+                    .counters()
+                    .list()
+                    .into_iter()
+                    .map(|(name, count)| (name.into(), count.into()))
+                    .collect();
                 let data = json!({
                     "device": device.name(),
                     "echo": self.echo,

@@ -189,10 +189,9 @@ fn call(span: Span, words: &[u16], only: Option<WriteFunction>) -> Result<Call, 
         (Table::Holding, _, None | Some(WriteFunction::MultipleRegisters)) => {
             Ok(Call::WriteRegisters { address, words: words.to_vec() })
         }
-        (table, _, Some(only)) => Err(format!(
-            "the device takes only function {} here; expected a single {table}",
-            only.code()
-        )),
+        (table, _, Some(only)) => {
+            Err(format!("the device takes only function {} here; expected a single {table}", only.code()))
+        }
         (table, _, None) => Err(format!("`{table}` can only be read")),
     }
 }

@@ -53,8 +53,13 @@ impl Scanning {
     }
 
     fn take(&mut self, call: &Call, result: &Result<Answer, RequestError>) {
-        if !matches!(result, Ok(_) | Err(RequestError::Exception(_))) {
-            // Silent; or broken, and then the next question would be as well.
+        let is_silence = match result {
+            Ok(_) => false,
+            // With 10 and 11 a gateway says that nobody is there.
+            Err(RequestError::Exception(code)) => matches!(code, 10 | 11),
+            Err(_) => true,
+        };
+        if is_silence {
             self.questions.clear();
             return;
         }
@@ -128,7 +133,8 @@ impl Bus {
     /// Asks the next unit, if its time has come. Whether anything was done.
     pub(in crate::engine::bus) fn next_scan(&mut self) -> bool {
         let now = self.now;
-        let Some(scanning) = self.requests.scanning.as_mut().filter(|scanning| scanning.next_at <= now) else {
+        let Some(scanning) = self.requests.scanning.as_mut().filter(|scanning| scanning.next_at <= now)
+        else {
             return false;
         };
         let unit = scanning.unit;
