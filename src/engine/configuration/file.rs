@@ -146,7 +146,7 @@ record! {
         settings: Option<Part<Map<String, Setting>>>,
         /// Coils and holding registers that a `write` request on MQTT may write as they are, past the
         /// rules of the profile: `[holding 10..19]`. None unless said.
-        raw_write: Part<Vec<At<Span>>> = Part::of(Vec::new()),
+        raw_write: Part<Vec<Part<At<Span>>>> = Part::of(Vec::new()),
     }
 }
 

@@ -335,8 +335,9 @@ impl Resolver<'_> {
     }
 
     /// What may be written as it is lies in a table that can be written, and touches nothing forbidden.
-    fn raw_write(&mut self, spans: &[At<Span>], device: &Device) -> Vec<Span> {
-        for span in spans {
+    fn raw_write(&mut self, spans: &[Part<At<Span>>], device: &Device) -> Vec<Span> {
+        let spans = || spans.iter().filter_map(Part::get);
+        for span in spans() {
             if !span.table().is_writable() {
                 self.faults.add(
                     &span.place,
@@ -353,7 +354,7 @@ impl Resolver<'_> {
                 self.faults.add(&span.place, message);
             }
         }
-        spans.iter().map(|span| span.value).collect()
+        spans().map(|span| span.value).collect()
     }
 
     fn device_name(&mut self, name: &At<Name>, file: &Configuration) {
