@@ -39,6 +39,7 @@ pub mod topics;
 pub mod bus;
 pub mod command;
 pub mod memory;
+pub mod reload;
 pub mod request;
 pub mod upkeep;
 

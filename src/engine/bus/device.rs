@@ -77,6 +77,8 @@ pub(super) struct DeviceState {
     beats: Beats,
     /// When the points that tell events last did.
     happened: BTreeMap<PointIndex, Time>,
+    /// The configuration knows it no more, or knows it otherwise: nothing more is begun with it.
+    pub(super) is_leaving: bool,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -127,6 +129,7 @@ impl DeviceState {
             told_things: vec![None; settings.device.things.len()],
             beats: Beats::new(&settings.device),
             happened: BTreeMap::new(),
+            is_leaving: false,
             settings,
         }
     }

@@ -4,6 +4,7 @@
 //! `ask_next` chooses the next: the command that has begun, heartbeats that are late, waiting commands,
 //! heartbeats, what somebody asked for, settings that are not as they are wanted, a scan, then whichever device's read (or identification) is most urgent.
 
+mod change;
 mod commands;
 mod device;
 mod fetch;
@@ -20,7 +21,7 @@ use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Cost;
 use crate::engine::request;
-use crate::engine::settings::{Link, OnBrokerLoss, Settings};
+use crate::engine::settings::{DeviceSettings, Link, OnBrokerLoss, Settings};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
@@ -49,6 +50,10 @@ pub enum Event {
     },
     /// A program asks something.
     Request(request::Request),
+    /// The device of this name leaves the bus: [`Bus::has_device`].
+    Retire(String),
+    /// Devices come to the bus, with what is remembered of them.
+    Adopt(Vec<DeviceSettings>, Memories),
     BrokerUp,
     BrokerDown,
     /// The time of [`Bus::wake_at`] has come.
@@ -193,8 +198,7 @@ impl Bus {
             bus_name: bus.name.clone(),
             republish: settings.republish,
         };
-        // Until a device's own latency is measured.
-        let cost = Cost::of(&bus.link, Duration::from_millis(5));
+        let cost = cost(&bus.link);
         let of_bus = settings.devices.iter().filter(|device| device.bus == index);
         let mut devices: Vec<DeviceState> =
             of_bus.map(|device| DeviceState::new(device.clone(), cost, settings.eeprom)).collect();
@@ -238,11 +242,14 @@ impl Bus {
             Event::Command(command) => self.command(command),
             Event::Get { device, point } => self.get(&device, &point),
             Event::Request(request) => self.request(request),
+            Event::Retire(device) => self.retire(&device),
+            Event::Adopt(devices, memories) => self.adopt(devices, &memories),
             Event::BrokerUp => self.broker_up = true,
             Event::BrokerDown => self.broker_up = false,
             Event::Wake => {}
             Event::Shutdown => self.stopping = true,
         }
+        self.end_retirements();
         self.expire_commands();
         self.expire_requests();
         if self.stopping {
@@ -282,6 +289,10 @@ impl Bus {
             .chain(beats)
             .chain(records)
             .min()
+    }
+
+    fn cost(&self) -> Cost {
+        cost(&self.link)
     }
 
     /// Whether a shutdown has been asked for and nothing is in flight any more.
@@ -484,9 +495,11 @@ impl Bus {
         true
     }
 
-    /// A device whose watchdog must run out is not spoken to while the broker is away.
+    /// Not a device that leaves. And one whose watchdog must run out is not spoken to while the broker is away.
     fn may_ask(&self, device: &DeviceState) -> bool {
-        self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog()
+        let is_to_be_fed =
+            self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog();
+        is_to_be_fed && !device.is_leaving
     }
 
     fn remember(&mut self) {
@@ -515,6 +528,11 @@ impl Bus {
         self.in_flight = Some(InFlight { device: None, purpose, sent_at: now });
         self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
     }
+}
+
+/// What a read costs, until a device's own latency is measured.
+fn cost(link: &Link) -> Cost {
+    Cost::of(link, Duration::from_millis(5))
 }
 
 /// The share of time in which the wire is busy: two buckets of a minute.

@@ -79,6 +79,15 @@ pub(super) enum Progress {
     Done { status: Status, data: Json, error: Option<String> },
 }
 
+impl Requests {
+    /// The numbers of all devices that requests are for.
+    pub(super) fn devices(&mut self) -> impl Iterator<Item = &mut usize> {
+        let waiting = self.waiting.iter_mut().map(|waiting| &mut waiting.device);
+        let running = self.running.iter_mut().map(|running| &mut running.device);
+        waiting.chain(running).chain(self.refreshes.iter_mut().map(|refresh| &mut refresh.device))
+    }
+}
+
 impl Progress {
     fn failed(error: impl Into<String>) -> Progress {
         Progress::Done { status: Status::Error, data: Json::Null, error: Some(error.into()) }
@@ -341,6 +350,11 @@ impl Bus {
 
     /// The link is gone, or about to be: what has begun cannot go on.
     pub(super) fn break_requests(&mut self, reason: &str) {
+        self.break_running(reason);
+        self.end_scan(Some(reason));
+    }
+
+    fn break_running(&mut self, reason: &str) {
         if let Some(Running { request, device, flow, .. }) = self.requests.running.take() {
             let error = match &flow {
                 Flow::Write(write) => {
@@ -353,7 +367,6 @@ impl Bus {
             };
             self.refuse(&request, &error);
         }
-        self.end_scan(Some(reason));
     }
 
     /// The program ends.
@@ -370,6 +383,23 @@ impl Bus {
         }
         if self.in_flight.is_none() {
             self.break_requests(reason);
+        }
+    }
+
+    /// A device leaves.
+    pub(super) fn refuse_requests_of(&mut self, device: usize, reason: &str) {
+        if self.requests.running.as_ref().is_some_and(|running| running.device == device) {
+            self.break_running(reason);
+        }
+        let all = std::mem::take(&mut self.requests.waiting).into_iter();
+        let (of_it, rest): (Vec<_>, Vec<_>) = all.partition(|waiting| waiting.device == device);
+        self.requests.waiting = rest.into();
+        let all = std::mem::take(&mut self.requests.refreshes).into_iter();
+        let (refreshes, rest): (Vec<_>, Vec<_>) = all.partition(|refresh| refresh.device == device);
+        self.requests.refreshes = rest;
+        let requests = of_it.into_iter().map(|waiting| waiting.request);
+        for request in requests.chain(refreshes.into_iter().map(|refresh| refresh.request)) {
+            self.refuse(&request, reason);
         }
     }
 
