@@ -127,8 +127,12 @@ mod tests {
             devices: vec![device],
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
-        let text = render(&GatewayReport { broker, buses: vec![BusHealth { report, responding: true }] })
-            .expect("text takes everything");
+        let text = render(&GatewayReport {
+            broker,
+            buses: vec![BusHealth { report, responding: true }],
+            configuration_error: None,
+        })
+        .expect("text takes everything");
         for line in [
             "busker_broker_connected 1.0",
             "busker_bus_up{bus=\"cellar\"} 1.0",

@@ -54,6 +54,12 @@ impl Mailbox {
         self.news.notify_one();
     }
 
+    /// Does something with all that waits or is remembered.
+    pub fn change(&self, change: impl FnOnce(&mut Outbox)) {
+        change(&mut self.outbox());
+        self.news.notify_one();
+    }
+
     fn outbox(&self) -> MutexGuard<'_, Outbox> {
         // The outbox is whole after every call, whoever panicked meanwhile.
         self.outbox.lock().unwrap_or_else(PoisonError::into_inner)

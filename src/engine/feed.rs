@@ -155,7 +155,14 @@ mod tests {
             devices: vec![device],
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
-        Look { at, report: GatewayReport { broker, buses: vec![BusHealth { report, responding: true }] } }
+        Look {
+            at,
+            report: GatewayReport {
+                broker,
+                buses: vec![BusHealth { report, responding: true }],
+                configuration_error: None,
+            },
+        }
     }
 
     fn device(look: &mut Look) -> &mut DeviceReport {

@@ -266,6 +266,8 @@ impl ThingReport {
 pub struct GatewayReport {
     pub broker: BrokerReport,
     pub buses: Vec<BusHealth>,
+    /// Why the newest configuration is not the one that runs.
+    pub configuration_error: Option<String>,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -384,7 +386,7 @@ mod tests {
             devices: devices.collect(),
         };
         let broker = BrokerReport { connected, ..BrokerReport::default() };
-        GatewayReport { broker, buses: vec![BusHealth { report, responding }] }
+        GatewayReport { broker, buses: vec![BusHealth { report, responding }], configuration_error: None }
     }
 
     #[test]

@@ -29,7 +29,10 @@ pub struct Parts {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Fate {
     /// It goes on. These devices leave it, and then these come to it; a changed one does both.
-    Stays { leave: Vec<String>, come: Vec<DeviceSettings> },
+    Stays {
+        leave: Vec<String>,
+        come: Vec<DeviceSettings>,
+    },
     /// Its link or what concerns all of its devices has changed.
     Restarts,
     Begins,
@@ -37,9 +40,7 @@ pub enum Fate {
 
 impl Parts {
     pub fn is_nothing(&self) -> bool {
-        let stays = |(_, fate): &(String, Fate)| {
-            matches!(fate, Fate::Stays { leave, come } if leave.is_empty() && come.is_empty())
-        };
+        let stays = |(_, fate): &(String, Fate)| matches!(fate, Fate::Stays { leave, come } if leave.is_empty() && come.is_empty());
         !self.broker && !self.http && self.ended.is_empty() && self.buses.iter().all(stays)
     }
 }
@@ -98,8 +99,7 @@ pub fn topics_of_devices(settings: &Settings) -> BTreeSet<String> {
     let of_device = |device: &DeviceSettings| {
         let points = device.device.points.iter().map(|point| &point.name);
         let things = device.device.things.iter().map(|thing| &thing.name);
-        let states: Vec<String> =
-            points.chain(things).map(|name| topics.state(&device.name, name)).collect();
+        let states: Vec<String> = points.chain(things).map(|name| topics.state(&device.name, name)).collect();
         [topics.availability(&device.name), topics.info(&device.name)].into_iter().chain(states)
     };
     settings.devices.iter().flat_map(of_device).collect()
@@ -145,7 +145,8 @@ devices:
                         Fate::Begins => words.push(format!("{name} begins")),
                         Fate::Stays { leave, come } => {
                             words.extend(leave.iter().map(|device| format!("{device} leaves {name}")));
-                            words.extend(come.iter().map(|device| format!("{} comes to {name}", device.name)));
+                            words
+                                .extend(come.iter().map(|device| format!("{} comes to {name}", device.name)));
                         }
                     }
                 }
@@ -163,13 +164,21 @@ devices:
         check(&[("localhost", "other")], "broker");
         check(&[("mqtt:", "http: {listen: null}\nmqtt:")], "http");
         check(&[("two: {bus: a, unit: 2", "two: {bus: a, unit: 3")], "two leaves a, two comes to a");
-        check(&[("two: {bus: a", "two: {bus: b"), ("three: {bus: b", "three: {bus: a")],
-            "two leaves a, three comes to a, three leaves b, two comes to b");
+        check(
+            &[("two: {bus: a", "two: {bus: b"), ("three: {bus: b", "three: {bus: a")],
+            "two leaves a, three comes to a, three leaves b, two comes to b",
+        );
         check(&[("three:", "four:")], "three leaves b, four comes to b");
         check(&[("host:503", "host:504")], "b restarts");
         check(&[("{a: ", "{c: {tcp: 'host:505'}, a: ")], "c begins");
         check(&[("b: {tcp", "c: {tcp"), ("bus: b", "bus: c")], "c begins, b ends");
-        check(&[("{a: {tcp: 'host:502'}, b: {tcp: 'host:503'}}", "{b: {tcp: 'host:503'}, a: {tcp: 'host:502'}}")], "");
+        check(
+            &[(
+                "{a: {tcp: 'host:502'}, b: {tcp: 'host:503'}}",
+                "{b: {tcp: 'host:503'}, a: {tcp: 'host:502'}}",
+            )],
+            "",
+        );
         check(&[("mqtt:", "republish: 5m\nmqtt:")], "a restarts, b restarts");
         check(&[("'mqtt://localhost'", "'mqtt://localhost', base_topic: house")], "everything");
         check(&[("mqtt:", "home_assistant: {discovery: false}\nmqtt:")], "everything");

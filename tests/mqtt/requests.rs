@@ -29,7 +29,8 @@ fn a_program_reads_writes_and_finds_out_over_mqtt() {
     let (broker, simulation) = (Broker::start(), simulation());
     let port = over_tcp(&simulation);
     let watcher = Watcher::start(&broker, "watcher");
-    let text = configuration(&port).replace("name: Relays", "name: Relays, raw_write: [holding 66, coil 0..3]");
+    let text =
+        configuration(&port).replace("name: Relays", "name: Relays, raw_write: [holding 66, coil 0..3]");
     let gateway = Gateway::start(&broker, &text);
     wait_until_all_is_online(&watcher);
 
@@ -48,14 +49,20 @@ fn a_program_reads_writes_and_finds_out_over_mqtt() {
     let refused = ask(&watcher, "write", json!({"device": "relays", "at": "holding 65", "value": 1}), "4");
     assert_eq!(refused["status"], "error");
     let refused = ask(&watcher, "write", json!({"device": "counters", "at": "coil 0", "value": 1}), "5");
-    assert!(refused["error"].as_str().is_some_and(|error| error.contains("raw_write: [coil 0]")), "{refused}");
+    assert!(
+        refused["error"].as_str().is_some_and(|error| error.contains("raw_write: [coil 0]")),
+        "{refused}"
+    );
 
     let identity = ask(&watcher, "identify", json!({"device": "relays"}), "6");
     assert_eq!(identity["data"]["objects"]["product"], "MR-DO4", "{identity}");
     assert_eq!(identity["data"]["profile"]["matches"], true);
 
     let diagnostics = ask(&watcher, "diagnostics", json!({"device": "counters"}), "7");
-    assert!(diagnostics["data"]["busker"]["requests"].as_u64().is_some_and(|count| count > 3), "{diagnostics}");
+    assert!(
+        diagnostics["data"]["busker"]["requests"].as_u64().is_some_and(|count| count > 3),
+        "{diagnostics}"
+    );
 
     watcher.forget();
     let refreshed = ask(&watcher, "refresh", json!({"device": "counters"}), "8");
@@ -116,7 +123,10 @@ fn a_paused_bus_gives_its_port_away_and_takes_it_back() {
     });
     let (code, health) = gateway.get("/health");
     let health = json(&health);
-    assert_eq!((code, &health["status"], &health["buses"]["line"]["paused"]), (200, &"degraded".into(), &true.into()));
+    assert_eq!(
+        (code, &health["status"], &health["buses"]["line"]["paused"]),
+        (200, &"degraded".into(), &true.into())
+    );
 
     watcher.forget();
     ask(&watcher, "pause", json!({"device": "relays", "for": "0s"}), "2");

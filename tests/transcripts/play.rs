@@ -141,6 +141,12 @@ impl Player {
                     other => panic!("{other:?}"),
                 }
             }
+            "retire" => self.bus.handle(self.now, Event::Retire(rest.into())),
+            // A header line, `device NAME UNIT KIND`.
+            "adopt" => {
+                let devices = devices::settings(rest).devices;
+                self.bus.handle(self.now, Event::Adopt(devices, self.memories.clone()));
+            }
             "answer" => self.answer(rest),
             "devices-answer" => self.answering = true,
             "silent" => self.silent.push(rest.parse().expect("a unit")),

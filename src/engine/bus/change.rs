@@ -16,7 +16,8 @@ impl Bus {
     pub(super) fn retire(&mut self, name: &str) {
         let Some(index) = self.devices.iter().position(|device| device.name() == name) else { return };
         self.devices[index].is_leaving = true;
-        let (of_it, others) = self.waiting.take_all().into_iter().partition(|waiting| waiting.device == index);
+        let (of_it, others) =
+            self.waiting.take_all().into_iter().partition(|waiting| waiting.device == index);
         self.waiting.put_all(others);
         for waiting in Vec::into_iter(of_it) {
             let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, REASON);
@@ -40,8 +41,13 @@ impl Bus {
             asked == Some(index) || self.active.as_ref().is_some_and(|active| active.device == index)
         };
         let leaves = |(index, device): (usize, &DeviceState)| device.is_leaving && !is_busy(index);
-        let leaving: Vec<usize> =
-            self.devices.iter().enumerate().filter(|(index, device)| leaves((*index, device))).map(|(index, _)| index).collect();
+        let leaving: Vec<usize> = self
+            .devices
+            .iter()
+            .enumerate()
+            .filter(|(index, device)| leaves((*index, device)))
+            .map(|(index, _)| index)
+            .collect();
         for index in leaving.into_iter().rev() {
             // A command of it may have ended just now, and wait to be read back.
             self.retire(&self.devices[index].name().to_string());

@@ -69,7 +69,22 @@ impl GatewayReport {
                 "connects": self.broker.connects,
                 "dropped": self.broker.dropped,
             },
+            "configuration": {"error": self.configuration_error},
         })
+    }
+
+    /// `bridge/info`, with what may change while the settings do not.
+    pub fn info_json(&self, settings: &Settings) -> Value {
+        let paused: Map<String, Value> = self
+            .buses
+            .iter()
+            .filter(|bus| bus.report.paused)
+            .map(|bus| (bus.report.name.clone(), bus.report.reason.clone().into()))
+            .collect();
+        let mut info = info_json(settings);
+        info["paused"] = paused.into();
+        info["configuration"] = json!({"error": self.configuration_error});
+        info
     }
 
     /// `GET /api/buses`: a list.
