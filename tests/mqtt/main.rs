@@ -1,5 +1,6 @@
 //! The whole program between simulated devices and a real broker.
 
+mod reload;
 mod requests;
 mod rig;
 mod watching;

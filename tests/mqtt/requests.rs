@@ -1,7 +1,7 @@
 //! What programs ask the gateway over MQTT, and how it answers.
 
-use std::fs::File;
-
+use busker::edge::link::Link;
+use busker::engine::settings::{self, Line, Parity};
 use busker::simulator::{DeviceAt, Model, Options, Simulation};
 use serde_json::{Value as Json, json};
 
@@ -107,7 +107,10 @@ fn a_paused_bus_gives_its_port_away_and_takes_it_back() {
     let link = format!("serial: {}, baud: 19200, parity: even", line.path().display());
     let gateway = Gateway::start(&broker, &crate::devices_on(&link));
     wait_until_all_is_online(&watcher);
-    let is_taken = || File::open(line.path()).is_err();
+    let path = line.path().display().to_string();
+    let line_settings = Line { baud: 19200, parity: Parity::Even, stop_bits: 1 };
+    let is_taken =
+        || Link::open(&settings::Link::Serial { path: path.clone(), line: line_settings }).is_err();
     assert!(is_taken(), "the port is the gateway's alone");
 
     let paused = ask(&watcher, "pause", json!({"bus": "line", "for": "10m"}), "1");
