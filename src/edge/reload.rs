@@ -108,11 +108,11 @@ impl App {
         let before = old.buses.iter().map(|bus| bus.name.clone()).zip(self.plant.buses());
         let mut running: BTreeMap<String, Arc<BusHandle>> = before.collect();
         let stays = |name: &str| {
-            let stays = |(bus, fate): &(String, Fate)| bus == name && matches!(fate, Fate::Stays { .. });
-            parts.buses.iter().any(|entry| stays(entry))
+            let mut fates = parts.buses.iter();
+            fates.any(|(bus, fate)| bus == name && matches!(fate, Fate::Stays { .. }))
         };
         // Nobody asks a bus that is about to end, and takes its silence for a fault.
-        self.reporter.keep(|name| stays(name));
+        self.reporter.keep(stays);
         let ending: Vec<String> = running.keys().filter(|name| !stays(name)).cloned().collect();
         let ended = ending.iter().filter_map(|name| running.remove(name)).collect();
         end_buses(&self.runtime, ended);

@@ -6,6 +6,7 @@ use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Identification, Reply, Request, RequestError};
 use busker::engine::profile::Library;
 use busker::engine::request::{Decision, Desk};
+use busker::engine::settings::{DeviceSettings, Settings};
 use busker::engine::time::{Date, Duration, Time};
 use proptest::prelude::*;
 
@@ -48,6 +49,8 @@ enum Happening {
     Ends(End),
     Command(usize),
     Request(usize),
+    /// The configuration of a device changes: it leaves, and comes again when it has left.
+    Changed(usize),
     LinkDown,
     LinkUp,
     Time(u16),
@@ -70,6 +73,7 @@ fn happening() -> impl Strategy<Value = Happening> {
         1 => Just(Happening::Ends(End::Checksum)),
         3 => (0..COMMANDS.len()).prop_map(Happening::Command),
         3 => (0..REQUESTS.len()).prop_map(Happening::Request),
+        1 => (0usize..5).prop_map(Happening::Changed),
         1 => Just(Happening::LinkDown),
         2 => Just(Happening::LinkUp),
         4 => (0u16..2000).prop_map(Happening::Time),
@@ -103,6 +107,8 @@ struct Observed {
     outcomes: usize,
     /// Commands sent to points that exist.
     commands: usize,
+    settings: Settings,
+    leaving: Vec<DeviceSettings>,
     desk: Desk,
     requests: usize,
     responses: usize,
@@ -127,6 +133,12 @@ impl Observed {
 
     fn handle(&mut self, event: Event) {
         self.bus.handle(self.now, event);
+        self.take_actions();
+        let bus = &self.bus;
+        let is_gone = |device: &DeviceSettings| !bus.has_device(&device.name);
+        let (gone, leaving) = std::mem::take(&mut self.leaving).into_iter().partition(is_gone);
+        self.leaving = leaving;
+        self.bus.handle(self.now, Event::Adopt(gone, Memories::default()));
         self.take_actions();
     }
 
@@ -172,6 +184,13 @@ impl Observed {
                     Decision::Answer(_) => {}
                     other => panic!("{other:?}"),
                 }
+            }
+            Happening::Changed(index) => {
+                let device = &self.settings.devices[*index];
+                if !self.leaving.contains(device) {
+                    self.leaving.push(device.clone());
+                }
+                self.handle(Event::Retire(device.name.clone()));
             }
             Happening::LinkDown => {
                 self.in_flight = None;
@@ -222,6 +241,8 @@ proptest! {
             desk: Desk::new(&settings, Library::default()),
             requests: 0,
             responses: 0,
+            leaving: Vec::new(),
+            settings,
         };
         observed.take_actions();
         observed.play(&Happening::LinkUp);

@@ -5,7 +5,7 @@ use crate::engine::memory::Memories;
 use crate::engine::settings::DeviceSettings;
 
 use super::device::DeviceState;
-use super::{Action, Bus, LinkState};
+use super::{Action, Bus, InFlight, LinkState, Purpose};
 
 /// What commands and requests of a device are told that leaves.
 const REASON: &str = "the configuration of the device has changed";
@@ -14,19 +14,29 @@ impl Bus {
     /// The device begins nothing more, and is gone as soon as nothing of it is on the wire:
     /// [`Bus::has_device`].
     pub(super) fn retire(&mut self, name: &str) {
-        let Some(index) = self.devices.iter().position(|device| device.name() == name) else { return };
-        self.devices[index].is_leaving = true;
-        let (of_it, others) =
+        if let Some(index) = self.devices.iter().position(|device| device.name() == name) {
+            self.devices[index].is_leaving = true;
+            self.refuse_all_of(index);
+        }
+    }
+
+    /// Ends everything of this device that waits.
+    fn refuse_all_of(&mut self, index: usize) {
+        let (of_it, others): (Vec<_>, Vec<_>) =
             self.waiting.take_all().into_iter().partition(|waiting| waiting.device == index);
         self.waiting.put_all(others);
-        for waiting in Vec::into_iter(of_it) {
+        for waiting in of_it {
             let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, REASON);
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
         self.end_settling_of(Some(index), &format!("written, but not read back: {REASON}"));
         self.refuse_requests_of(index, REASON);
         self.beat = self.beat.take().filter(|(device, ..)| *device != index);
-        self.fetches.retain(|fetch| fetch.device != index);
+        // The answer to the one under way, which is the first, still comes.
+        let is_under_way = |in_flight: &InFlight| matches!(in_flight.purpose, Purpose::Fetch);
+        let kept = usize::from(self.in_flight.as_ref().is_some_and(is_under_way));
+        let rest = self.fetches.split_off(kept.min(self.fetches.len()));
+        self.fetches.extend(rest.into_iter().filter(|fetch| fetch.device != index));
     }
 
     /// Whether the device is here, if only until the question on the wire has been answered.
@@ -36,21 +46,15 @@ impl Bus {
 
     /// Lets go of the devices that leave and have nothing on the wire any more.
     pub(super) fn end_retirements(&mut self) {
-        let is_busy = |index: usize| {
-            let asked = self.in_flight.as_ref().and_then(|in_flight| in_flight.device);
-            asked == Some(index) || self.active.as_ref().is_some_and(|active| active.device == index)
-        };
-        let leaves = |(index, device): (usize, &DeviceState)| device.is_leaving && !is_busy(index);
-        let leaving: Vec<usize> = self
-            .devices
-            .iter()
-            .enumerate()
-            .filter(|(index, device)| leaves((*index, device)))
-            .map(|(index, _)| index)
-            .collect();
-        for index in leaving.into_iter().rev() {
-            // A command of it may have ended just now, and wait to be read back.
-            self.retire(&self.devices[index].name().to_string());
+        let asked = self.in_flight.as_ref().and_then(|in_flight| in_flight.device);
+        let commanded = self.active.as_ref().map(|active| active.device);
+        for index in (0..self.devices.len()).rev() {
+            let is_busy = asked == Some(index) || commanded == Some(index);
+            if is_busy || !self.devices[index].is_leaving {
+                continue;
+            }
+            // What has come since it was told to leave, or waits to be read back.
+            self.refuse_all_of(index);
             let mut device = self.devices.remove(index);
             if let Some(record) = device.record(self.now, true) {
                 self.context.actions.push_back(Action::Store(record));

@@ -413,7 +413,7 @@ impl Bus {
                 self.counters.writes += 1;
                 device.beat_written(self.now, point, &result, &mut self.context);
             }
-            Purpose::Request => self.request_answered(result),
+            Purpose::Request => self.request_answered(in_flight.sent_at, result),
             // Has been seen to.
             Purpose::Scan(_) => {}
         }

@@ -25,6 +25,9 @@ pub(super) use scan::Scanning;
 
 /// More requests than this are not kept waiting.
 const WAITING_MAX: usize = 16;
+/// After a question to a device that may be away, and that nobody answers, requests leave the bus alone so
+/// many times as long as it took.
+const SILENCE_FACTOR: u32 = 3;
 /// How long a request may wait until it begins.
 const TIME_TO_LIVE: Duration = Duration::from_secs(10);
 
@@ -39,6 +42,8 @@ pub(super) struct Requests {
     pub(super) pause: Option<Request>,
     /// Something has just been asked for a request: what else is due comes before its next question.
     asked: bool,
+    /// Nothing is asked before, since nobody answered.
+    not_before: Time,
 }
 
 /// A request that has not begun.
@@ -182,7 +187,7 @@ impl Bus {
 
     /// Goes on with the request that has begun, or begins the first that can. Whether anything was done.
     pub(super) fn begin_request(&mut self) -> bool {
-        if self.requests.asked {
+        if self.requests.asked || self.now < self.requests.not_before {
             return false;
         }
         if self.requests.running.is_none() {
@@ -225,7 +230,7 @@ impl Bus {
     }
 
     /// The question of the request that has begun was answered, or not.
-    pub(super) fn request_answered(&mut self, result: Result<Answer, RequestError>) {
+    pub(super) fn request_answered(&mut self, sent_at: Time, result: Result<Answer, RequestError>) {
         let Some(Running { request, device, mut flow, .. }) = self.requests.running.take() else { return };
         let state = &mut self.devices[device];
         if flow.wants_presence() {
@@ -233,6 +238,8 @@ impl Bus {
                 Ok(_) | Err(RequestError::Exception(_) | RequestError::Impossible(_)) => {}
                 Err(error) => state.failed(self.now, error, &mut self.context),
             }
+        } else if result == Err(RequestError::Timeout) {
+            self.requests.not_before = self.now + (self.now - sent_at) * SILENCE_FACTOR;
         }
         let state = &mut self.devices[device];
         let progress = match &mut flow {
@@ -405,16 +412,19 @@ impl Bus {
 
     /// When the bus must be woken for a request.
     pub(super) fn requests_wake_at(&self) -> Option<Time> {
+        let not_before = self.requests.not_before;
         let running = self.requests.running.as_ref().and_then(|running| match running.next {
             Next::At(time, _) => Some(time),
+            Next::Ask(_) if not_before > self.now => Some(not_before),
             Next::Ask(_) | Next::InFlight => None,
         });
+        let silence = (!self.requests.waiting.is_empty()).then_some(not_before);
         let spared = self.requests.waiting.iter().filter_map(|waiting| match &waiting.flow {
             Flow::Write(write) => Some(self.devices[waiting.device].writable_from(write.points())),
             _ => None,
         });
         let scan = self.requests.scanning.as_ref().map(Scanning::next_at);
-        spared.filter(|at| *at > self.now).chain(running).chain(scan).min()
+        spared.chain(silence).filter(|at| *at > self.now).chain(running).chain(scan).min()
     }
 
     /// When the next request has waited too long.
