@@ -54,7 +54,8 @@ pub fn compare(old: &Settings, new: &Settings) -> Change {
     if concerns_all(old) != concerns_all(new) {
         return Change::Everything;
     }
-    let same_rules = old.republish == new.republish && old.on_broker_loss == new.on_broker_loss;
+    let rules = |settings: &Settings| (settings.republish, settings.on_broker_loss, settings.eeprom);
+    let same_rules = rules(old) == rules(new);
     let fate = |bus: &Bus| match old.buses.iter().find(|other| other.name == bus.name) {
         None => Fate::Begins,
         Some(before) if before != bus || !same_rules => Fate::Restarts,

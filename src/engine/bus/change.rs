@@ -80,7 +80,7 @@ impl Bus {
     /// These devices come, as at the start of the bus.
     pub(super) fn adopt(&mut self, devices: Vec<DeviceSettings>, memories: &Memories) {
         for settings in devices {
-            let mut device = DeviceState::new(settings, self.cost());
+            let mut device = DeviceState::new(settings, self.cost(), self.eeprom);
             self.counters.persistent_writes += device.recall(memories);
             device.introduce(self.now, &mut self.context);
             if self.link_state == LinkState::Up {

@@ -21,7 +21,7 @@ use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Cost;
 use crate::engine::request;
-use crate::engine::settings::{DeviceSettings, Link, OnBrokerLoss, Settings};
+use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settings};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
@@ -104,6 +104,7 @@ pub struct Bus {
     link: Link,
     response_timeout: Duration,
     on_broker_loss: OnBrokerLoss,
+    eeprom: Eeprom,
     context: Context,
     devices: Vec<DeviceState>,
     waiting: WaitingCommands,
@@ -212,6 +213,7 @@ impl Bus {
             link: bus.link.clone(),
             response_timeout: bus.response_timeout,
             on_broker_loss: settings.on_broker_loss,
+            eeprom: settings.eeprom,
             context,
             devices,
             waiting: WaitingCommands::default(),

@@ -191,15 +191,11 @@ impl Bus {
             return false;
         }
         if self.requests.running.is_none() {
-            let (devices, now) = (&self.devices, self.now);
+            let devices = &self.devices;
             let can_begin = |waiting: &Waiting| {
                 let device = &devices[waiting.device];
                 let is_there = !waiting.flow.wants_presence() || device.is_present_and_answers();
-                let spared_until = match &waiting.flow {
-                    Flow::Write(write) => device.writable_from(write.points()),
-                    _ => Time::default(),
-                };
-                is_there && self.may_ask(device) && now >= spared_until
+                is_there && self.may_ask(device)
             };
             let Some(at) = self.requests.waiting.iter().position(can_begin) else { return false };
             let Some(Waiting { request, device, mut flow, .. }) = self.requests.waiting.remove(at) else {
@@ -329,13 +325,8 @@ impl Bus {
             (expired, rest.into())
         };
         self.requests.waiting = rest;
-        for Waiting { request, device, flow, .. } in expired {
-            let reason = match &flow {
-                Flow::Write(write) if self.devices[device].writable_from(write.points()) > now => {
-                    "its EEPROM is written too often".to_string()
-                }
-                _ => self.why_not(device),
-            };
+        for Waiting { request, device, .. } in expired {
+            let reason = self.why_not(device);
             self.refuse(&request, &format!("it did not begin in time: {reason}"));
         }
         let refreshes = std::mem::take(&mut self.requests.refreshes).into_iter();
@@ -419,12 +410,8 @@ impl Bus {
             Next::Ask(_) | Next::InFlight => None,
         });
         let silence = (!self.requests.waiting.is_empty()).then_some(not_before);
-        let spared = self.requests.waiting.iter().filter_map(|waiting| match &waiting.flow {
-            Flow::Write(write) => Some(self.devices[waiting.device].writable_from(write.points())),
-            _ => None,
-        });
         let scan = self.requests.scanning.as_ref().map(Scanning::next_at);
-        spared.chain(silence).filter(|at| *at > self.now).chain(running).chain(scan).min()
+        silence.into_iter().filter(|at| *at > self.now).chain(running).chain(scan).min()
     }
 
     /// When the next request has waited too long.

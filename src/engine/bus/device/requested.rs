@@ -137,9 +137,14 @@ impl DeviceState {
         Ok(())
     }
 
-    /// From when on all of `points` may be written, for their EEPROM's sake.
-    pub(in crate::engine::bus) fn writable_from(&self, points: &[PointIndex]) -> Time {
-        points.iter().map(|point| self.writable_at(Target::Point(*point))).max().unwrap_or_default()
+    /// Why `points` may not be written now, for their EEPROM's sake.
+    pub(in crate::engine::bus) fn why_spared(&self, now: Time, points: &[PointIndex]) -> Option<String> {
+        let allowed = points.iter().map(|point| self.writable_at(Target::Point(*point))).max();
+        if let Some(allowed) = allowed.filter(|allowed| now < *allowed) {
+            let left = (allowed - now).as_secs() + 1;
+            return Some(format!("this EEPROM has just been written; the next write may come in {left} s"));
+        }
+        points.iter().find_map(|point| self.is_spent(now, *point))
     }
 
     /// One write to all of `points` goes out. How often EEPROM is written by it.

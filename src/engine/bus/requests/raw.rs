@@ -98,6 +98,9 @@ impl RawWrite {
                     if found == self.words {
                         return self.ended("unchanged", Some(&found), None);
                     }
+                    if let Some(reason) = device.why_spared(now, &self.points) {
+                        return self.ended("refused", Some(&found), Some(reason));
+                    }
                     self.state = State::Writing;
                     Progress::Ask(self.call.clone())
                 }
