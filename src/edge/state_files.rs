@@ -314,6 +314,31 @@ mod tests {
     }
 
     #[test]
+    fn a_device_that_comes_later_goes_on_from_what_is_remembered_of_it_now() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let files = StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
+        files.store(Record { device: "one".into(), memory: memory(7) });
+        drop(files);
+        let files = StateFiles::open(folder.path(), ["two"].into_iter()).expect("a thread");
+        files.store(Record { device: "two".into(), memory: memory(2) });
+        let learnt = files.learn(["one", "two", "three"].into_iter());
+        let expected = [("one".to_string(), memory(7)), ("two".to_string(), memory(2))];
+        assert_eq!((learnt.devices, learnt.unkept), (BTreeMap::from(expected), None));
+        // A folder in the place of the file, which cannot be kept aside since its place is taken.
+        let devices = folder.path().join("devices");
+        fs::create_dir_all(devices.join("four.json")).expect("a folder");
+        for number in ["", ".2", ".3"].into_iter().map(String::from).chain((4..=99).map(|n| format!(".{n}")))
+        {
+            fs::write(devices.join(format!("four.json.broken{number}")), "").expect("a file");
+        }
+        assert!(files.learn(["four"].into_iter()).unkept.is_some());
+        assert_eq!(files.memories().unkept, None, "the others are kept all the same");
+        files.store(Record { device: "four".into(), memory: memory(1) });
+        drop(files);
+        assert!(devices.join("four.json").is_dir(), "it is not overwritten");
+    }
+
+    #[test]
     fn a_damaged_file_is_kept_aside_and_replaces_no_other() {
         let folder = tempfile::tempdir().expect("a folder");
         let devices = folder.path().join("devices");

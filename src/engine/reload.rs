@@ -118,7 +118,7 @@ buses: {a: {tcp: 'host:502'}, b: {tcp: 'host:503'}}
 devices:
   one: {bus: a, unit: 1, points: {x: {at: input 0, poll: fast}}}
   two: {bus: a, unit: 2, points: {x: {at: input 0, poll: fast}}}
-  three: {bus: b, unit: 1, points: {x: {at: input 0, poll: fast}}}
+  three: {bus: b, unit: 3, points: {x: {at: input 0, poll: fast}}}
 ";
 
     fn settings(text: &str) -> Settings {
@@ -161,9 +161,9 @@ devices:
 
     #[test]
     fn only_what_changed_is_touched() {
-        check(&[("mqtt:", "# nothing but a comment\nmqtt:")], "");
+        check(&[("\nmqtt:", "\n# nothing but a comment\nmqtt:")], "");
         check(&[("localhost", "other")], "broker");
-        check(&[("mqtt:", "http: {listen: null}\nmqtt:")], "http");
+        check(&[("\nmqtt:", "\nhttp: {listen: null}\nmqtt:")], "http");
         check(&[("two: {bus: a, unit: 2", "two: {bus: a, unit: 3")], "two leaves a, two comes to a");
         check(
             &[("two: {bus: a", "two: {bus: b"), ("three: {bus: b", "three: {bus: a")],
@@ -180,9 +180,10 @@ devices:
             )],
             "",
         );
-        check(&[("mqtt:", "republish: 5m\nmqtt:")], "a restarts, b restarts");
+        check(&[("\nmqtt:", "\neeprom: {daily: 7}\nmqtt:")], "a restarts, b restarts");
+        check(&[("\nmqtt:", "\nrepublish: 5m\nmqtt:")], "a restarts, b restarts");
         check(&[("'mqtt://localhost'", "'mqtt://localhost', base_topic: house")], "everything");
-        check(&[("mqtt:", "home_assistant: {discovery: false}\nmqtt:")], "everything");
-        check(&[("mqtt:", "state_dir: /tmp\nmqtt:")], "everything");
+        check(&[("\nmqtt:", "\nhome_assistant: {discovery: false}\nmqtt:")], "everything");
+        check(&[("\nmqtt:", "\nstate_dir: /tmp\nmqtt:")], "everything");
     }
 }

@@ -279,3 +279,49 @@ fn systemd_is_told_when_the_configuration_is_being_read_and_when_that_is_over() 
         hear("READY=1");
     }
 }
+
+#[test]
+fn what_a_changed_device_has_no_more_is_taken_back_at_the_broker() {
+    let (broker, witness) = (Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start_with(&text(&broker, &[&steady], &[&pump]));
+    watcher.wait_for("busker/pump/flow", "0");
+    let config = "homeassistant/device/busker_pump/config";
+    watcher.wait_until("discovery", |got| got.topic == config);
+
+    watcher.forget();
+    gateway.write(&text(&broker, &[&steady], &[&pump.replace("flow", "rate")]));
+    gateway.reload(DONE);
+    watcher.wait_for("busker/pump/flow", "");
+    watcher.wait_for("busker/pump/rate", "0");
+    // Home Assistant is told that the one is gone before it is told of the other alone.
+    let components = |got: &Received| json(&got.payload)["components"].clone();
+    watcher.wait_until("the farewell", |got| {
+        got.topic == config && components(got)["flow"].as_object().is_some_and(|flow| flow.len() == 1)
+    });
+    let all = remembered(&broker, "newcomer");
+    let left = all.iter().find(|got| got.topic == config).expect("the pump is announced");
+    assert!(components(left)["flow"].is_null() && components(left)["rate"].is_object(), "{}", left.payload);
+    assert!(!topics_of(&all, "pump").contains(&"busker/pump/flow"));
+}
+
+#[test]
+fn http_moves_to_another_address() {
+    let (broker, witness) = (Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let text = text(&broker, &[&steady], &[&pump]);
+    let gateway = Gateway::start_with(&text);
+    let state = tempfile::tempdir().expect("a folder");
+    let at = |http: &str| format!("http: {{listen: {http}}}\nstate_dir: {}\n{text}", state.path().display());
+    gateway.write_whole(&at("'localhost:0'"));
+    gateway.reload("HTTP on http://");
+    let lines = gateway.log();
+    let moved = lines.iter().rev().find_map(|line| line.split("HTTP on ").nth(1)).expect("its address");
+    let status = |url: &str| ureq::get(url).call().map(|answer| answer.status().as_u16()).ok();
+    eventually(|| (status(moved) == Some(200)).then_some(())).expect("HTTP answers at its new address");
+    eventually(|| status(&format!("{}/health", gateway.http())).is_none().then_some(())).expect("and not at the old one");
+    gateway.write_whole(&at("null"));
+    gateway.reload(DONE);
+    eventually(|| status(moved).is_none().then_some(())).expect("HTTP is off");
+}
