@@ -344,6 +344,11 @@ impl Resolver<'_> {
                     format!("`{}` can only be read; expected spans of `coil` or `holding`", span.value),
                 );
             }
+            for left_out in device.left_out.iter().filter(|other| other.span.overlaps(span.value)) {
+                let (found, inside, reason) = (span.value, left_out.span, &left_out.reason);
+                let message = format!("`{found}` touches `{inside}`, which the profile leaves out: {reason}");
+                self.warnings.add(&span.place, message);
+            }
             if let Some(forbidden) =
                 device.wire.forbidden.iter().find(|other| other.span.overlaps(span.value))
             {
