@@ -141,7 +141,7 @@ impl App {
 
 /// What is known of the gateway before anything has happened.
 pub(super) fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
-    mailbox.push(Message::retained(topics.bridge_info(), health::info_json(settings).to_string()));
+    mailbox.push(info(settings, topics));
     if settings.home_assistant.discovery {
         let gateway = Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant);
         mailbox.push(homeassistant::announce_bridge(&gateway).message());
@@ -149,6 +149,11 @@ pub(super) fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox)
             mailbox.push(homeassistant::announce_bus(&gateway, &bus.name).message());
         }
     }
+}
+
+/// `bridge/info` while all is well.
+fn info(settings: &Settings, topics: &Topics) -> Message {
+    Message::retained(topics.bridge_info(), health::info_json(settings).to_string())
 }
 
 /// Starts the buses of these numbers of the plant's settings. An error means that none of them runs.
@@ -229,7 +234,7 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
     let mut ticks = tokio::time::interval(every);
     let rounds = TELL_HEALTH_EVERY.as_millis() / every.as_millis().max(1);
     let mut told: Option<Vec<bool>> = None;
-    let mut told_info: Option<Message> = None;
+    let mut told_info = info(&plant.settings(), &plant.topics());
     for round in 0u128.. {
         ticks.tick().await;
         let report = reporter.report().await;
@@ -243,9 +248,9 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
             told = Some(states);
         }
         let info = plant.info(&report);
-        if told_info.as_ref() != Some(&info) {
+        if told_info != info {
             mailbox.push(info.clone());
-            told_info = Some(info);
+            told_info = info;
         }
     }
 }

@@ -32,6 +32,8 @@ pub fn info_json(settings: &Settings) -> Value {
         "buses": buses,
         "devices": devices,
         "profiles": profiles,
+        "paused": {},
+        "configuration": {"error": null},
     })
 }
 
