@@ -4,7 +4,7 @@
 //! What needs the device (its limits, what is forbidden) is checked where the device is, by the bus.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 use serde_json::{Map, Value as Json, json};
 
@@ -121,6 +121,8 @@ pub struct Scan {
     pub last: u8,
     /// Each profile with what its device says of itself.
     pub known: Arc<Vec<(String, Identify)>>,
+    /// As long as somebody has it, the scan is under way, and the desk takes no other.
+    pub ticket: Arc<()>,
 }
 
 /// How far a request has come.
@@ -181,6 +183,8 @@ pub struct Desk {
     library: Library,
     /// The identifications in the library, once somebody has wanted them.
     known: Option<Arc<Vec<(String, Identify)>>>,
+    /// Of the last scan.
+    ticket: Weak<()>,
     /// Verbs of which a retained request has been seen.
     warned: BTreeSet<String>,
 }
@@ -195,6 +199,7 @@ impl Desk {
             buses: buses.collect(),
             library,
             known: None,
+            ticket: Weak::new(),
             warned: BTreeSet::new(),
         }
     }
@@ -252,7 +257,12 @@ impl Desk {
             Verb::Scan => {
                 let bus = self.bus(object.text("bus")?.ok_or_else(|| object.missing("bus"))?)?;
                 let (first, last) = self.units(bus, object.text("units")?)?;
-                Ok((bus, Wish::Scan(Scan { first, last, known: self.known() })))
+                if self.ticket.strong_count() > 0 {
+                    return Err("a scan is under way; there is one at a time".into());
+                }
+                let ticket = Arc::new(());
+                self.ticket = Arc::downgrade(&ticket);
+                Ok((bus, Wish::Scan(Scan { first, last, known: self.known(), ticket })))
             }
             Verb::Pause => {
                 let bus = match (object.text("bus")?, object.text("device")?) {
@@ -527,6 +537,22 @@ devices:
             };
             assert!(message.payload.starts_with(&payload[..payload.len() - 1]), "{}", message.payload);
         }
+    }
+
+    #[test]
+    fn there_is_one_scan_at_a_time() {
+        let mut desk = desk();
+        let mut ask = |bus: &str| desk.take(Date(0), "scan", &format!(r#"{{"bus":"{bus}"}}"#), false);
+        let first = ask("basement");
+        assert!(matches!(first, Decision::Ask(0, _)), "{first:?}");
+        let second = ask("plant");
+        assert!(
+            matches!(&second, Decision::Answer(message) if message.payload.contains("one at a time")),
+            "{second:?}"
+        );
+        drop(first);
+        let third = ask("plant");
+        assert!(matches!(third, Decision::Ask(1, _)), "{third:?}");
     }
 
     #[test]

@@ -105,6 +105,7 @@ impl Scanning {
 
 impl Bus {
     pub(super) fn scan(&mut self, request: Request, scan: &Scan) {
+        // The desk that gave the ticket may be another one since a reload.
         if self.requests.scanning.is_some() {
             return self.refuse(&request, "a scan of this bus is under way; it is one at a time");
         }
