@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use anyhow::Context;
+
 use crate::edge::app::{
     App, BUSES_END_WITHIN, Secrets, connect, end_buses, introduce, start_bus, start_buses, watched,
 };
@@ -28,8 +30,11 @@ impl App {
         let secrets = Secrets::read(&settings)?;
         let old = self.plant.settings();
         let change = reload::compare(&old, &settings);
-        // The same address can be taken only when it has been left.
-        let moves = old.http.listen != settings.http.listen;
+        // The same port can be taken only when it has been left.
+        let port = self.http_address().map(|address| format!(":{}", address.port()));
+        let is_its_own = |listen: &String| port.as_ref().is_some_and(|port| listen.ends_with(port));
+        let moves =
+            old.http.listen != settings.http.listen && !settings.http.listen.as_ref().is_some_and(is_its_own);
         let listener = match &settings.http.listen {
             Some(listen) if moves => Some(self.runtime.block_on(Http::bind(listen))?),
             Some(_) | None => None,
@@ -224,7 +229,10 @@ impl App {
         }
         let listener = match (listener, listen) {
             (Some(listener), _) => Some(listener),
-            (None, Some(listen)) => Some(self.runtime.block_on(Http::bind(listen))?),
+            (None, Some(listen)) => {
+                let bound = self.runtime.block_on(Http::bind(listen));
+                Some(bound.context("the new configuration works only in part")?)
+            }
             (None, None) => None,
         };
         let _inside = self.runtime.enter();

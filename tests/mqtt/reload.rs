@@ -320,7 +320,18 @@ fn http_moves_to_another_address() {
     let moved = lines.iter().rev().find_map(|line| line.split("HTTP on ").nth(1)).expect("its address");
     let status = |url: &str| ureq::get(url).call().map(|answer| answer.status().as_u16()).ok();
     eventually(|| (status(moved) == Some(200)).then_some(())).expect("HTTP answers at its new address");
-    eventually(|| status(&format!("{}/health", gateway.http())).is_none().then_some(())).expect("and not at the old one");
+    eventually(|| status(&format!("{}/health", gateway.http())).is_none().then_some(()))
+        .expect("and not at the old one");
+    // The same port by another name, and with a token.
+    let port = moved.split('/').nth(2).and_then(|host| host.rsplit(':').next()).expect("its port");
+    let token = "x".repeat(32);
+    gateway.write_whole(&at(&format!("'localhost:{port}', token: {token}")));
+    gateway.reload(DONE);
+    let devices = moved.replace("/health", "/api/devices");
+    assert_eq!(status(moved), Some(200));
+    assert_eq!(status(&devices), None, "without the token nobody is let in");
+    let with_token = ureq::get(&devices).header("Authorization", format!("Bearer {token}")).call();
+    assert_eq!(with_token.expect("the token is known").status().as_u16(), 200);
     gateway.write_whole(&at("null"));
     gateway.reload(DONE);
     eventually(|| status(moved).is_none().then_some(())).expect("HTTP is off");
