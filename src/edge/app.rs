@@ -39,7 +39,7 @@ pub struct App {
     pub(super) clock: Clock,
     pub(super) plant: Arc<Plant>,
     pub(super) broker: Option<Broker>,
-    pub(super) secrets: Secrets,
+    pub(super) keys: Keys,
     pub(super) http: Option<Http>,
     pub(super) reporter: Arc<Reporter>,
     pub(super) state: Arc<StateFiles>,
@@ -48,21 +48,21 @@ pub struct App {
 
 /// What the settings name and does not stand in them. It may change while they do not.
 #[derive(Clone, PartialEq, Eq)]
-pub(super) struct Secrets {
+pub(super) struct Keys {
     password: Option<String>,
     pub(super) token: Option<String>,
 }
 
-impl Secrets {
-    pub(super) fn read(settings: &Settings) -> anyhow::Result<Secrets> {
-        Ok(Secrets {
+impl Keys {
+    pub(super) fn read(settings: &Settings) -> anyhow::Result<Keys> {
+        Ok(Keys {
             password: files::read_secret("password", &settings.mqtt.password)?,
             token: files::read_token(&settings.http.token)?,
         })
     }
 
     /// Whether the broker would find no difference.
-    pub(super) fn is_same_broker(&self, other: &Secrets) -> bool {
+    pub(super) fn is_same_broker(&self, other: &Keys) -> bool {
         self.password == other.password
     }
 }
@@ -71,7 +71,7 @@ impl App {
     /// Starts everything, going on from what is remembered in `state`. By `library` a scan
     /// knows devices. An error means that nothing is left running.
     pub fn start(settings: Settings, library: Library, state: StateFiles) -> anyhow::Result<App> {
-        let secrets = Secrets::read(&settings)?;
+        let keys = Keys::read(&settings)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .thread_name("edge")
@@ -92,14 +92,14 @@ impl App {
         plant.set_buses(buses.clone());
 
         let _inside = runtime.enter();
-        let broker = connect(&plant, &secrets, clock);
+        let broker = connect(&plant, &keys, clock);
         let of_reporter = plant.clone();
         let watched = watched(&plant.settings(), &buses, clock, &state);
         let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched));
         let http =
-            listener.map(|listener| Http::serve(listener, reporter.clone(), clock, secrets.token.clone()));
+            listener.map(|listener| Http::serve(listener, reporter.clone(), clock, keys.token.clone()));
         let watch = tokio::spawn(watch(reporter.clone(), plant.clone()));
-        Ok(App { runtime, clock, plant, broker: Some(broker), secrets, http, reporter, state, watch })
+        Ok(App { runtime, clock, plant, broker: Some(broker), keys, http, reporter, state, watch })
     }
 
     /// Where HTTP listens, if it does.
@@ -203,10 +203,10 @@ pub(super) fn end_buses(runtime: &Runtime, buses: Vec<Arc<BusHandle>>) {
 }
 
 /// Connects to the plant's broker. Only within a runtime.
-pub(super) fn connect(plant: &Arc<Plant>, secrets: &Secrets, clock: Clock) -> Broker {
+pub(super) fn connect(plant: &Arc<Plant>, keys: &Keys, clock: Clock) -> Broker {
     let of_route = plant.clone();
     let route = move |news| of_route.tell(news);
-    let broker = Broker::start(&plant.settings(), secrets.password.clone(), clock, plant.mailbox(), route);
+    let broker = Broker::start(&plant.settings(), keys.password.clone(), clock, plant.mailbox(), route);
     plant.set_connection(broker.state());
     broker
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::Context;
 
 use crate::edge::app::{
-    App, BUSES_END_WITHIN, Secrets, connect, end_buses, introduce, start_bus, start_buses, watched,
+    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, start_bus, start_buses, watched,
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
@@ -27,7 +27,7 @@ impl App {
     /// otherwise. Not from within a runtime.
     pub fn reload(&mut self, settings: Settings, library: Library) -> anyhow::Result<()> {
         // What can fail comes before what cannot.
-        let secrets = Secrets::read(&settings)?;
+        let keys = Keys::read(&settings)?;
         let old = self.plant.settings();
         let change = reload::compare(&old, &settings);
         // The same port can be taken only when it has been left.
@@ -39,20 +39,20 @@ impl App {
             Some(listen) if moves => Some(self.runtime.block_on(Http::bind(listen))?),
             Some(_) | None => None,
         };
-        let http_ends = old.http != settings.http || secrets.token != self.secrets.token;
+        let http_ends = old.http != settings.http || keys.token != self.keys.token;
         let listen = settings.http.listen.clone();
         match change {
             Change::Everything => {
                 tracing::info!("the new configuration changes what everything is made of: all begins anew");
-                self.begin_anew(&old, settings, library, secrets)?;
+                self.begin_anew(&old, settings, library, keys)?;
             }
             Change::Parts(parts) => {
-                if parts.is_nothing() && secrets == self.secrets {
+                if parts.is_nothing() && keys == self.keys {
                     tracing::info!("the new configuration changes nothing that runs");
                 }
                 self.exchange(&old, settings, library, &parts)?;
-                let reconnects = parts.broker || !secrets.is_same_broker(&self.secrets);
-                self.secrets = secrets;
+                let reconnects = parts.broker || !keys.is_same_broker(&self.keys);
+                self.keys = keys;
                 if reconnects {
                     tracing::info!("the connection to the broker is made anew");
                     self.reconnect();
@@ -76,7 +76,7 @@ impl App {
         old: &Settings,
         settings: Settings,
         library: Library,
-        secrets: Secrets,
+        keys: Keys,
     ) -> anyhow::Result<()> {
         self.reporter.replace(Vec::new());
         end_buses(&self.runtime, self.plant.buses());
@@ -96,9 +96,9 @@ impl App {
         introduce(&self.plant.settings(), &self.plant.topics(), &self.plant.mailbox());
         let buses = start_buses(&self.plant, everyone, self.clock, &self.state)?;
         self.plant.set_buses(buses.clone());
-        self.secrets = secrets;
+        self.keys = keys;
         let _inside = self.runtime.enter();
-        self.broker = Some(connect(&self.plant, &self.secrets, self.clock));
+        self.broker = Some(connect(&self.plant, &self.keys, self.clock));
         self.reporter.replace(watched(&self.plant.settings(), &buses, self.clock, &self.state));
         Ok(())
     }
@@ -220,7 +220,7 @@ impl App {
             self.runtime.block_on(broker.finish());
         }
         let _inside = self.runtime.enter();
-        self.broker = Some(connect(&self.plant, &self.secrets, self.clock));
+        self.broker = Some(connect(&self.plant, &self.keys, self.clock));
     }
 
     fn exchange_http(&mut self, listener: Option<Bound>, listen: Option<&str>) -> anyhow::Result<()> {
@@ -236,7 +236,7 @@ impl App {
             (None, None) => None,
         };
         let _inside = self.runtime.enter();
-        let token = self.secrets.token.clone();
+        let token = self.keys.token.clone();
         self.http = listener.map(|listener| Http::serve(listener, self.reporter.clone(), self.clock, token));
         if let Some(address) = self.http_address() {
             tracing::info!("HTTP on http://{address}/health");
