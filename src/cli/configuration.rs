@@ -24,15 +24,16 @@ pub struct ConfigurationArgs {
 impl ConfigurationArgs {
     /// The settings; warnings are told on standard error.
     pub fn load(&self) -> Result<Settings, Failure> {
-        load(&self.config)?.map(Loaded::settings_with_warnings).map_err(faults)
+        load(&self.config)?.map(Loaded::told).map(|loaded| loaded.settings).map_err(faults)
     }
 
-    /// The same for a verb that talks to the broker: the files of the broker's section are there.
-    pub fn load_with_broker(&self) -> Result<Settings, Failure> {
+    /// The same for the verb that talks to the broker, with the profiles that were known: the files of
+    /// the broker's section are there.
+    pub fn load_with_broker(&self) -> Result<Loaded, Failure> {
         let loaded = load(&self.config)?.map_err(faults)?;
         let mut found = loaded.tls_faults();
         found.extend(loaded.secret_faults());
-        if found.is_empty() { Ok(loaded.settings_with_warnings()) } else { Err(faults(found)) }
+        if found.is_empty() { Ok(loaded.told()) } else { Err(faults(found)) }
     }
 }
 
@@ -75,11 +76,12 @@ impl Loaded {
         configuration::fault_at(name, bytes, keys, message)
     }
 
-    fn settings_with_warnings(self) -> Settings {
+    /// Itself, with its warnings told.
+    fn told(self) -> Loaded {
         for warning in &self.warnings {
             eprintln!("warning: {}: {}", warning.place, warning.message);
         }
-        self.settings
+        self
     }
 }
 

@@ -101,6 +101,17 @@ impl Failure {
         }
     }
 
+    /// All of it as a text of its own, for where nobody reads standard error.
+    pub fn to_text(&self) -> String {
+        match self {
+            Failure::Failed(error) | Failure::WrongInput(error) => format!("{error:#}"),
+            Failure::Faults { faults, .. } => {
+                let faults: Vec<&str> = faults.iter().map(|fault| fault.trim_end()).collect();
+                faults.join("\n\n")
+            }
+        }
+    }
+
     pub fn exit_code(&self) -> u8 {
         match self {
             Failure::Failed(_) => 1,

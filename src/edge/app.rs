@@ -1,7 +1,6 @@
 //! Starts what runs and ends it in order: one thread per bus, and a small runtime for the broker and
 //! HTTP.
 
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
@@ -13,16 +12,16 @@ use crate::edge::bus_thread::{self, BusHandle};
 use crate::edge::clock::Clock;
 use crate::edge::files;
 use crate::edge::http::Http;
-use crate::edge::mqtt::{Broker, Mailbox, News};
-use crate::edge::reports::{Ask, Reporter};
+use crate::edge::mqtt::{Broker, Mailbox};
+use crate::edge::plant::Plant;
+use crate::edge::reports::{Reporter, Watched};
 use crate::edge::secrets::Secrets;
-use crate::edge::shutdown::{self, Signals};
+use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
-use crate::engine::bus::{Bus, Command, Event};
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::bus::Bus;
 use crate::engine::health::{self, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
-use crate::engine::outbox::Outbox;
+use crate::engine::profile::Library;
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 use crate::engine::topics::{Message, Topics};
@@ -33,25 +32,47 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 const TELL_HEALTH_EVERY: Duration = Duration::from_secs(60);
 
 /// How long the buses may take to finish what is in flight.
-const BUSES_END_WITHIN: Duration = Duration::from_secs(10);
+pub(super) const BUSES_END_WITHIN: Duration = Duration::from_secs(10);
 
 /// A running gateway.
 pub struct App {
-    runtime: Runtime,
-    buses: Arc<Vec<BusHandle>>,
-    broker: Broker,
-    http: Option<Http>,
-    reporter: Arc<Reporter>,
+    pub(super) runtime: Runtime,
+    pub(super) clock: Clock,
+    pub(super) plant: Arc<Plant>,
+    pub(super) broker: Option<Broker>,
+    pub(super) keys: Keys,
+    pub(super) http: Option<Http>,
+    pub(super) reporter: Arc<Reporter>,
+    pub(super) state: Arc<StateFiles>,
     watch: JoinHandle<()>,
-    state: Arc<StateFiles>,
+}
+
+/// What the settings name and does not stand in them. It may change while they do not.
+#[derive(Clone, PartialEq, Eq)]
+pub(super) struct Keys {
+    password: Option<String>,
+    pub(super) token: Option<String>,
+}
+
+impl Keys {
+    pub(super) fn read(settings: &Settings) -> anyhow::Result<Keys> {
+        Ok(Keys {
+            password: files::read_secret("password", &settings.mqtt.password)?,
+            token: files::read_token(&settings.http.token)?,
+        })
+    }
+
+    /// Whether the broker would find no difference.
+    pub(super) fn is_same_broker(&self, other: &Keys) -> bool {
+        self.password == other.password
+    }
 }
 
 impl App {
-    /// Starts everything, going on from what is remembered in `state`. An error means that nothing is left
-    /// running.
-    pub fn start(settings: Settings, state: StateFiles) -> anyhow::Result<App> {
-        let secrets = Secrets::read(&settings.mqtt)?;
-        let token = files::read_token(&settings.http.token)?;
+    /// Starts everything, going on from what is remembered in `state`. By `library` a scan
+    /// knows devices. An error means that nothing is left running.
+    pub fn start(settings: Settings, library: Library, state: StateFiles) -> anyhow::Result<App> {
+        let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .thread_name("edge")
@@ -59,32 +80,27 @@ impl App {
             .build()
             .context("the runtime cannot be started")?;
         let clock = Clock::start();
-        let settings = Arc::new(settings);
         let state = Arc::new(state);
         // What can fail comes before what cannot.
         let listener = match &settings.http.listen {
             Some(listen) => Some(runtime.block_on(Http::bind(listen))?),
             None => None,
         };
-        let topics = Topics::new(&settings.mqtt.base_topic);
-        let outbox =
-            Outbox::new(topics.clone(), &settings.home_assistant.prefix, identities(&settings, &topics));
-        let mailbox = Arc::new(Mailbox::new(outbox));
-        introduce(&settings, &topics, &mailbox);
-        let buses = Arc::new(start_buses(&settings, clock, &state, &mailbox)?);
+        let plant = Arc::new(Plant::new(settings, library, clock));
+        introduce(&plant.settings(), &plant.topics(), &plant.mailbox());
+        let everyone = 0..plant.settings().buses.len();
+        let buses = start_buses(&plant, everyone, clock, &state)?;
+        plant.set_buses(buses.clone());
 
         let _inside = runtime.enter();
-        let route = Route::new(&settings, topics.clone(), buses.clone(), mailbox.clone());
-        let broker = Broker::start(&settings, secrets, clock, mailbox.clone(), move |news| route.tell(news));
-        let memories = state.memories();
-        let first = (0..buses.len())
-            .map(|index| Bus::new(clock.now(), &settings, index, memories).report(clock.now()))
-            .collect();
-        let connection = broker.state();
-        let reporter = Arc::new(Reporter::new(move || connection.report(), questions(&buses), first));
-        let http = listener.map(|listener| Http::serve(listener, reporter.clone(), clock, token));
-        let watch = tokio::spawn(watch(reporter.clone(), topics, mailbox));
-        Ok(App { runtime, buses, broker, http, reporter, watch, state })
+        let broker = connect(&plant, secrets, clock);
+        let of_reporter = plant.clone();
+        let watched = watched(&plant.settings(), &buses, clock, &state);
+        let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched));
+        let http =
+            listener.map(|listener| Http::serve(listener, reporter.clone(), clock, keys.token.clone()));
+        let watch = tokio::spawn(watch(reporter.clone(), plant.clone()));
+        Ok(App { runtime, clock, plant, broker: Some(broker), keys, http, reporter, state, watch })
     }
 
     /// Where HTTP listens, if it does.
@@ -97,29 +113,24 @@ impl App {
         self.runtime.block_on(self.reporter.report())
     }
 
-    /// Waits for SIGTERM or SIGINT.
-    pub fn wait_for_signal(&self) -> anyhow::Result<()> {
-        let name = self.runtime.block_on(async {
-            let mut signals = Signals::listen().context("signals cannot be heard")?;
-            anyhow::Ok(signals.wait().await)
-        })?;
-        tracing::info!("{name}: stopping");
-        Ok(())
+    /// From now on signals are heard, and do not end the program by themselves.
+    pub fn listen(&self) -> anyhow::Result<Signals> {
+        self.runtime.block_on(async { Signals::listen() }).context("signals cannot be heard")
+    }
+
+    /// Waits for a signal.
+    pub fn wait(&self, signals: &mut Signals) -> Heard {
+        self.runtime.block_on(signals.wait())
     }
 
     /// Ends in order: the buses finish what is in flight and say `offline`, then the gateway says it
     /// and disconnects.
     pub fn stop(self) {
         self.watch.abort();
-        self.buses.iter().for_each(BusHandle::shutdown);
-        self.runtime.block_on(async {
-            let buses = self.buses.clone();
-            let ended = tokio::task::spawn_blocking(move || buses.iter().for_each(BusHandle::join));
-            if tokio::time::timeout(BUSES_END_WITHIN, ended).await.is_err() {
-                tracing::warn!("a bus does not end; it is left alone");
-            }
-            self.broker.finish().await;
-        });
+        end_buses(&self.runtime, self.plant.buses());
+        if let Some(broker) = self.broker {
+            self.runtime.block_on(broker.finish());
+        }
         if let Some(http) = self.http {
             http.stop();
         }
@@ -129,16 +140,9 @@ impl App {
     }
 }
 
-/// Everything that Home Assistant may know of this gateway.
-fn identities(settings: &Settings, topics: &Topics) -> Vec<String> {
-    let buses = settings.buses.iter().map(|bus| topics.bus_identity(&bus.name));
-    let devices = settings.devices.iter().map(|device| topics.identity(&device.name));
-    buses.chain(devices).chain([topics.bridge_identity()]).collect()
-}
-
 /// What is known of the gateway before anything has happened.
-fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
-    mailbox.push(Message::retained(topics.bridge_info(), health::info_json(settings).to_string()));
+pub(super) fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
+    mailbox.push(info(settings, topics));
     if settings.home_assistant.discovery {
         let gateway = Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant);
         mailbox.push(homeassistant::announce_bridge(&gateway).message());
@@ -148,116 +152,114 @@ fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
     }
 }
 
-fn start_buses(
-    settings: &Arc<Settings>,
+/// `bridge/info` while all is well.
+fn info(settings: &Settings, topics: &Topics) -> Message {
+    Message::retained(topics.bridge_info(), health::info_json(settings).to_string())
+}
+
+/// Starts the buses of these numbers of the plant's settings. An error means that none of them runs.
+pub(super) fn start_buses(
+    plant: &Plant,
+    which: impl IntoIterator<Item = usize>,
     clock: Clock,
     state: &Arc<StateFiles>,
-    mailbox: &Arc<Mailbox>,
-) -> anyhow::Result<Vec<BusHandle>> {
-    let mut buses: Vec<BusHandle> = Vec::new();
-    for (index, bus) in settings.buses.iter().enumerate() {
-        let mailbox = mailbox.clone();
-        let publish = Box::new(move |message| mailbox.push(message));
-        match bus_thread::start(settings.clone(), index, clock, state.clone(), publish) {
+) -> anyhow::Result<Vec<Arc<BusHandle>>> {
+    let settings = plant.settings();
+    let mut buses: Vec<Arc<BusHandle>> = Vec::new();
+    for index in which {
+        match start_bus(&settings, index, clock, state, plant.mailbox()) {
             Ok(handle) => buses.push(handle),
             Err(error) => {
-                buses.iter().for_each(BusHandle::shutdown);
-                buses.iter().for_each(BusHandle::join);
-                return Err(error).with_context(|| format!("bus {} cannot be started", bus.name));
+                buses.iter().for_each(|bus| bus.shutdown());
+                buses.iter().for_each(|bus| bus.join());
+                return Err(error);
             }
         }
     }
     Ok(buses)
 }
 
-fn questions(buses: &Arc<Vec<BusHandle>>) -> Vec<Ask> {
-    (0..buses.len())
-        .map(|index| {
-            let buses = buses.clone();
-            let ask: Ask = Box::new(move || buses[index].inspect(|bus, now| bus.report(now)));
-            ask
-        })
-        .collect()
-}
-
-/// Brings what the broker tells to the buses that it concerns.
-struct Route {
-    /// Device to bus.
-    bus_of: BTreeMap<String, usize>,
-    topics: Topics,
-    buses: Arc<Vec<BusHandle>>,
+pub(super) fn start_bus(
+    settings: &Arc<Settings>,
+    index: usize,
+    clock: Clock,
+    state: &Arc<StateFiles>,
     mailbox: Arc<Mailbox>,
+) -> anyhow::Result<Arc<BusHandle>> {
+    let publish = Box::new(move |message| mailbox.push(message));
+    let started = bus_thread::start(settings.clone(), index, clock, state.clone(), publish);
+    let name = &settings.buses[index].name;
+    started.map(Arc::new).with_context(|| format!("bus {name} cannot be started"))
 }
 
-impl Route {
-    fn new(settings: &Settings, topics: Topics, buses: Arc<Vec<BusHandle>>, mailbox: Arc<Mailbox>) -> Route {
-        let bus_of = settings.devices.iter().map(|device| (device.name.clone(), device.bus)).collect();
-        Route { bus_of, topics, buses, mailbox }
-    }
-
-    fn tell(&self, news: News) {
-        match news {
-            News::Up => self.tell_all(Event::BrokerUp),
-            News::Down => self.tell_all(Event::BrokerDown),
-            News::Get { device, point } => {
-                self.tell_bus_of(&device.clone(), Event::Get { device, point });
-            }
-            News::Set { device, point, payload, retained } => {
-                let refused = Outcome::new(OutcomeKind::Refused, &payload, "too many commands wait");
-                let topic = self.topics.outcome(&device, &point);
-                let command = Command { device: device.clone(), point, payload, retained };
-                if !self.tell_bus_of(&device, Event::Command(command)) {
-                    self.mailbox.push(Message::once(topic, refused.to_json()));
-                }
-            }
+/// Ends these buses: what is in flight is finished, and `offline` is said.
+pub(super) fn end_buses(runtime: &Runtime, buses: Vec<Arc<BusHandle>>) {
+    buses.iter().for_each(|bus| bus.shutdown());
+    runtime.block_on(async {
+        let ended = tokio::task::spawn_blocking(move || buses.iter().for_each(|bus| bus.join()));
+        if tokio::time::timeout(BUSES_END_WITHIN, ended).await.is_err() {
+            tracing::warn!("a bus does not end; it is left alone");
         }
-    }
+    });
+}
 
-    fn tell_all(&self, event: Event) {
-        for bus in self.buses.iter() {
-            // A bus with a full inbox is stuck, and is reported as that.
-            if bus.send(event.clone()).is_err() {
-                tracing::warn!("a bus does not take news of the broker");
-            }
-        }
-    }
+/// Connects to the plant's broker. Only within a runtime.
+pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock) -> Broker {
+    let of_route = plant.clone();
+    let route = move |news| of_route.tell(news);
+    let broker = Broker::start(&plant.settings(), secrets, clock, plant.mailbox(), route);
+    plant.set_connection(broker.state());
+    broker
+}
 
-    /// `false` if the bus has no room for it.
-    fn tell_bus_of(&self, device: &str, event: Event) -> bool {
-        match self.bus_of.get(device) {
-            Some(bus) => self.buses[*bus].send(event).is_ok(),
-            None => {
-                tracing::debug!("a message for `{device}`, which is no device of this gateway");
-                true
-            }
-        }
-    }
+/// How the buses are asked how they are, and what is told before they have answered.
+pub(super) fn watched(
+    settings: &Settings,
+    buses: &[Arc<BusHandle>],
+    clock: Clock,
+    state: &StateFiles,
+) -> Vec<Arc<Watched>> {
+    let memories = state.memories();
+    let of_bus = |(index, bus): (usize, &Arc<BusHandle>)| {
+        let first = Bus::new(clock.now(), settings, index, &memories).report(clock.now());
+        let bus = bus.clone();
+        Arc::new(Watched::new(move || bus.inspect(|bus, now| bus.report(now)), first))
+    };
+    buses.iter().enumerate().map(of_bus).collect()
 }
 
 /// Looks at the gateway again and again: tells its health, and feeds systemd's watchdog while every
 /// bus answers.
-async fn watch(reporter: Arc<Reporter>, topics: Topics, mailbox: Arc<Mailbox>) {
+async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
     let every = shutdown::watchdog_interval().map_or(LOOK_EVERY, |interval| interval.min(LOOK_EVERY));
     let mut ticks = tokio::time::interval(every);
     let rounds = TELL_HEALTH_EVERY.as_millis() / every.as_millis().max(1);
     let mut told: Option<Vec<bool>> = None;
+    let mut told_info = info(&plant.settings(), &plant.topics());
     for round in 0u128.. {
         ticks.tick().await;
         let report = reporter.report().await;
         if report.buses.iter().all(|bus| bus.responding) {
             shutdown::feed_watchdog();
         }
+        let (topics, mailbox) = (plant.topics(), plant.mailbox());
         let states = states(&report);
         if round % rounds.max(1) == 0 || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
+        }
+        let info = plant.info(&report);
+        if told_info != info {
+            mailbox.push(info.clone());
+            told_info = info;
         }
     }
 }
 
 /// What is worth telling at once.
 fn states(report: &GatewayReport) -> Vec<bool> {
-    let buses = report.buses.iter().flat_map(|bus| [bus.report.up, bus.responding]);
+    let buses = report.buses.iter().flat_map(|bus| [bus.report.up, bus.report.paused, bus.responding]);
     let devices = report.devices().map(|(_, device)| device.online);
-    buses.chain(devices).chain([report.broker.connected, report.broker.client_id_taken]).collect()
+    let of_broker = [report.broker.connected, report.broker.client_id_taken];
+    buses.chain(devices).chain(of_broker).chain([report.configuration_error.is_some()]).collect()
 }

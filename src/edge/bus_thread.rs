@@ -63,7 +63,7 @@ pub fn start(
     let (thread_bell, thread_stop) = (bell.clone(), stop.clone());
     let thread =
         std::thread::Builder::new().name(format!("bus-{}", settings.buses[index].name)).spawn(move || {
-            let bus = Bus::new(clock.now(), &settings, index, state.memories());
+            let bus = Bus::new(clock.now(), &settings, index, &state.memories());
             let port = Port::Closed;
             let (bell, stop) = (thread_bell, thread_stop);
             let stopping = false;

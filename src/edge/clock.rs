@@ -1,8 +1,8 @@
 //! The program's one clock: everything else is told the time.
 
-use std::time::Instant;
+use std::time::{Instant, SystemTime};
 
-use crate::engine::time::{Duration, Time};
+use crate::engine::time::{Date, Duration, Time};
 
 /// Microseconds since the program started; copies share the same start.
 #[derive(Clone, Copy, Debug)]
@@ -18,6 +18,13 @@ impl Clock {
 
     pub fn now(self) -> Time {
         Time(self.start.elapsed().as_micros() as u64)
+    }
+
+    /// The date, for texts; nothing may be decided by it, since it can jump.
+    #[expect(clippy::disallowed_methods, reason = "this is the place that asks")]
+    pub fn today(self) -> Date {
+        let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        Date(since.map_or(0, |since| since.as_secs()))
     }
 
     /// How long from now until `time`; zero when it has passed.

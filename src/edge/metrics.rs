@@ -125,13 +125,18 @@ mod tests {
             line: None,
             up: true,
             reason: None,
+            paused: false,
             counters: Counters { requests: 12, ..Counters::default() },
             load: 0.25,
             devices: vec![device],
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
-        let text = render(&GatewayReport { broker, buses: vec![BusHealth { report, responding: true }] })
-            .expect("text takes everything");
+        let text = render(&GatewayReport {
+            broker,
+            buses: vec![BusHealth { report, responding: true }],
+            configuration_error: None,
+        })
+        .expect("text takes everything");
         for line in [
             "busker_broker_connected 1.0",
             "busker_broker_client_id_taken 0.0",

@@ -10,6 +10,8 @@ pub mod http;
 pub mod link;
 pub mod metrics;
 pub mod mqtt;
+pub mod plant;
+pub mod reload;
 pub mod reports;
 pub mod secrets;
 pub mod shutdown;

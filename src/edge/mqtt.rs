@@ -49,6 +49,12 @@ impl Mailbox {
         self.news.notify_one();
     }
 
+    /// Does something with all that waits or is remembered.
+    pub fn change(&self, change: impl FnOnce(&mut Outbox)) {
+        change(&mut self.outbox());
+        self.news.notify_one();
+    }
+
     fn outbox(&self) -> MutexGuard<'_, Outbox> {
         // The outbox is whole after every call, whoever panicked meanwhile.
         self.outbox.lock().unwrap_or_else(PoisonError::into_inner)
@@ -60,8 +66,23 @@ impl Mailbox {
 pub enum News {
     Up,
     Down,
-    Set { device: String, point: String, payload: String, retained: bool },
-    Get { device: String, point: String },
+    Set {
+        device: String,
+        point: String,
+        payload: String,
+        retained: bool,
+    },
+    Get {
+        device: String,
+        point: String,
+    },
+    /// `stale` says why it would be too old to be obeyed.
+    Request {
+        verb: String,
+        payload: String,
+        retained: bool,
+        stale: Option<String>,
+    },
 }
 
 /// How the connection is, for whoever wants to tell.
@@ -546,7 +567,10 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             Some(Incoming::Get { device, point }) if !retained => {
                 (self.tell)(News::Get { device: device.to_string(), point: point.to_string() });
             }
-            Some(Incoming::Get { .. } | Incoming::Request { .. }) | None => {}
+            Some(Incoming::Request { verb }) => {
+                (self.tell)(News::Request { verb: verb.to_string(), payload, retained, stale });
+            }
+            Some(Incoming::Get { .. }) | None => {}
         }
     }
 

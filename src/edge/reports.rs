@@ -1,6 +1,6 @@
 //! Asks every bus how it is, and notices the one that does not answer.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
@@ -14,40 +14,75 @@ const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 /// Asks a bus, which answers through the channel.
 pub type Ask = Box<dyn Fn() -> oneshot::Receiver<BusReport> + Send + Sync>;
 
+/// A bus that is asked how it is.
+pub struct Watched {
+    ask: Ask,
+    /// What it last said, for the time in which it says nothing.
+    last: Mutex<BusReport>,
+}
+
+impl Watched {
+    /// `first` is how the bus is before it has said anything.
+    pub fn new(
+        ask: impl Fn() -> oneshot::Receiver<BusReport> + Send + Sync + 'static,
+        first: BusReport,
+    ) -> Watched {
+        Watched { ask: Box::new(ask), last: Mutex::new(first) }
+    }
+}
+
 /// Knows how to reach everything that has something to report.
 pub struct Reporter {
     broker: Box<dyn Fn() -> BrokerReport + Send + Sync>,
-    buses: Vec<Ask>,
-    /// What each bus last said, for the time in which it says nothing.
-    last: Mutex<Vec<BusReport>>,
+    buses: Mutex<Vec<Arc<Watched>>>,
+    /// Why the newest configuration is not the one that runs.
+    configuration_error: Mutex<Option<String>>,
 }
 
 impl Reporter {
-    /// `first` is how each bus is before it has said anything.
     pub fn new(
         broker: impl Fn() -> BrokerReport + Send + Sync + 'static,
-        buses: Vec<Ask>,
-        first: Vec<BusReport>,
+        buses: Vec<Arc<Watched>>,
     ) -> Reporter {
-        Reporter { broker: Box::new(broker), buses, last: Mutex::new(first) }
+        Reporter { broker: Box::new(broker), buses: Mutex::new(buses), configuration_error: Mutex::default() }
+    }
+
+    /// Other buses are asked from now on.
+    pub fn replace(&self, buses: Vec<Arc<Watched>>) {
+        *lock(&self.buses) = buses;
+    }
+
+    /// Of the buses only these are asked from now on.
+    pub fn keep(&self, wanted: impl Fn(&str) -> bool) {
+        lock(&self.buses).retain(|bus| wanted(&lock(&bus.last).name));
+    }
+
+    pub fn set_configuration_error(&self, error: Option<String>) {
+        *lock(&self.configuration_error) = error;
     }
 
     /// The gateway as it is now; takes a second if a bus is stuck, and no longer if several are.
     pub async fn report(&self) -> GatewayReport {
         let deadline = Instant::now() + ANSWER_WITHIN;
-        let answers: Vec<oneshot::Receiver<BusReport>> = self.buses.iter().map(|ask| ask()).collect();
+        let watched = lock(&self.buses).clone();
+        let answers: Vec<oneshot::Receiver<BusReport>> = watched.iter().map(|bus| (bus.ask)()).collect();
         let mut buses = Vec::new();
-        for (index, answer) in answers.into_iter().enumerate() {
+        for (bus, answer) in watched.iter().zip(answers) {
             let answer = timeout_at(deadline, answer).await.ok().and_then(Result::ok);
             let responding = answer.is_some();
-            let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut last = lock(&bus.last);
             if let Some(report) = answer {
-                last[index] = report;
+                *last = report;
             }
-            buses.push(BusHealth { report: last[index].clone(), responding });
+            buses.push(BusHealth { report: last.clone(), responding });
         }
-        GatewayReport { broker: (self.broker)(), buses }
+        let configuration_error = lock(&self.configuration_error).clone();
+        GatewayReport { broker: (self.broker)(), buses, configuration_error }
     }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
@@ -62,6 +97,7 @@ mod tests {
             line: None,
             up: true,
             reason: None,
+            paused: false,
             counters: Counters { requests, ..Counters::default() },
             load: 0.0,
             devices: Vec::new(),
@@ -84,8 +120,9 @@ mod tests {
         });
         let gone: Ask = Box::new(|| oneshot::channel().1);
         let broker = || BrokerReport { connected: true, ..BrokerReport::default() };
-        let first = vec![bus("silent", 1), bus("good", 2), bus("gone", 3)];
-        let reporter = Reporter::new(broker, vec![silent, good, gone], first);
+        let asks = [(silent, bus("silent", 1)), (good, bus("good", 2)), (gone, bus("gone", 3))];
+        let watched = asks.map(|(ask, first)| Arc::new(Watched { ask, last: Mutex::new(first) }));
+        let reporter = Reporter::new(broker, watched.to_vec());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let report = runtime.expect("a runtime").block_on(reporter.report());
         let told: Vec<(&str, bool, u64)> = report

@@ -3,7 +3,7 @@
 //! Storing is a thread of its own: a memory card may take seconds to say that it has what it was
 //! given, and a bus waits for nobody.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -20,7 +20,11 @@ const TRY_AGAIN_AFTER: Duration = Duration::from_secs(60);
 
 /// What was remembered at the start, and where to put what is to be remembered.
 pub struct StateFiles {
-    memories: Memories,
+    /// The newest of each device.
+    memories: Mutex<Memories>,
+    /// Devices whose files must not be overwritten.
+    damaged: Mutex<BTreeSet<String>>,
+    folder: PathBuf,
     desk: Arc<Desk>,
     thread: Mutex<Option<JoinHandle<()>>>,
     keeps: bool,
@@ -42,8 +46,18 @@ struct Waiting {
 impl StateFiles {
     /// Keeps nothing, and remembers nothing.
     pub fn nowhere() -> StateFiles {
-        let memories = Memories { unkept: Some("nothing is kept".into()), ..Memories::default() };
-        StateFiles { memories, desk: Arc::default(), thread: Mutex::default(), keeps: false }
+        StateFiles::unkept(Memories { unkept: Some("nothing is kept".into()), ..Memories::default() })
+    }
+
+    fn unkept(memories: Memories) -> StateFiles {
+        StateFiles {
+            damaged: Mutex::default(),
+            memories: Mutex::new(memories),
+            folder: PathBuf::new(),
+            desk: Arc::default(),
+            thread: Mutex::default(),
+            keeps: false,
+        }
     }
 
     /// Reads what is remembered of these devices in `state_dir`. What is wrong with the files goes to
@@ -72,24 +86,55 @@ impl StateFiles {
                 "{reason}; counts of EEPROM writes end with this run, and `settings` are only compared, \
                  except where they are enforced"
             );
-            return Ok(StateFiles { memories, desk: Arc::default(), thread: Mutex::default(), keeps: false });
+            return Ok(StateFiles::unkept(memories));
         }
         let desk = Arc::<Desk>::default();
-        let of_thread = desk.clone();
+        let (of_thread, of_files) = (desk.clone(), folder.clone());
         let thread = std::thread::Builder::new()
             .name("state-files".into())
             .spawn(move || of_thread.work(&folder))
             .context("no thread can be started")?;
-        Ok(StateFiles { memories, desk, thread: Mutex::new(Some(thread)), keeps: true })
+        Ok(StateFiles {
+            memories: Mutex::new(memories),
+            damaged: Mutex::default(),
+            folder: of_files,
+            desk,
+            thread: Mutex::new(Some(thread)),
+            keeps: true,
+        })
     }
 
-    pub fn memories(&self) -> &Memories {
-        &self.memories
+    /// What is remembered now.
+    pub fn memories(&self) -> Memories {
+        lock(&self.memories).clone()
+    }
+
+    /// What is remembered now, also of these devices, which have come since the start.
+    pub fn learn<'d>(&self, devices: impl Iterator<Item = &'d str>) -> Memories {
+        let mut memories = lock(&self.memories);
+        let mut unkept = None;
+        for device in devices.filter(|_| self.keeps) {
+            if memories.devices.contains_key(device) {
+                continue;
+            }
+            match recall(&file_of(&self.folder, device)) {
+                Ok(Some(memory)) => drop(memories.devices.insert(device.into(), memory)),
+                Ok(None) => tracing::info!("nothing is remembered yet of {device}"),
+                Err(reason) => {
+                    tracing::warn!("{reason}");
+                    lock(&self.damaged).insert(device.into());
+                    unkept = Some(reason);
+                }
+            }
+        }
+        let unkept = unkept.or_else(|| memories.unkept.clone());
+        Memories { unkept, ..memories.clone() }
     }
 
     /// Puts a memory where it will be stored. Does not wait for that.
     pub fn store(&self, record: Record) {
-        if self.keeps {
+        if self.keeps && !lock(&self.damaged).contains(&record.device) {
+            lock(&self.memories).devices.insert(record.device.clone(), record.memory.clone());
             self.desk.lock().memories.insert(record.device, record.memory);
             self.desk.changed.notify_all();
         }
@@ -161,6 +206,10 @@ impl Desk {
             self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
         (std::mem::take(&mut waiting.memories), waiting.finish)
     }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn file_of(folder: &Path, device: &str) -> PathBuf {
@@ -252,7 +301,7 @@ mod tests {
     fn what_is_stored_is_there_after_a_restart_and_only_the_newest() {
         let folder = tempfile::tempdir().expect("a folder");
         let files = StateFiles::open(folder.path(), ["one", "two"].into_iter()).expect("a thread");
-        assert_eq!(files.memories(), &Memories::default());
+        assert_eq!(files.memories(), Memories::default());
         for writes in 1..=100 {
             files.store(Record { device: "one".into(), memory: memory(writes) });
         }
@@ -265,6 +314,31 @@ mod tests {
     }
 
     #[test]
+    fn a_device_that_comes_later_goes_on_from_what_is_remembered_of_it_now() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let files = StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
+        files.store(Record { device: "one".into(), memory: memory(7) });
+        drop(files);
+        let files = StateFiles::open(folder.path(), ["two"].into_iter()).expect("a thread");
+        files.store(Record { device: "two".into(), memory: memory(2) });
+        let learnt = files.learn(["one", "two", "three"].into_iter());
+        let expected = [("one".to_string(), memory(7)), ("two".to_string(), memory(2))];
+        assert_eq!((learnt.devices, learnt.unkept), (BTreeMap::from(expected), None));
+        // A folder in the place of the file, which cannot be kept aside since its place is taken.
+        let devices = folder.path().join("devices");
+        fs::create_dir_all(devices.join("four.json")).expect("a folder");
+        for number in ["", ".2", ".3"].into_iter().map(String::from).chain((4..=99).map(|n| format!(".{n}")))
+        {
+            fs::write(devices.join(format!("four.json.broken{number}")), "").expect("a file");
+        }
+        assert!(files.learn(["four"].into_iter()).unkept.is_some());
+        assert_eq!(files.memories().unkept, None, "the others are kept all the same");
+        files.store(Record { device: "four".into(), memory: memory(1) });
+        drop(files);
+        assert!(devices.join("four.json").is_dir(), "it is not overwritten");
+    }
+
+    #[test]
     fn a_damaged_file_is_kept_aside_and_replaces_no_other() {
         let folder = tempfile::tempdir().expect("a folder");
         let devices = folder.path().join("devices");
@@ -272,7 +346,7 @@ mod tests {
             fs::create_dir_all(&devices).expect("a folder");
             fs::write(devices.join("one.json"), content).expect("a file");
             let files = StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
-            assert_eq!(files.memories(), &Memories::default(), "round {round}");
+            assert_eq!(files.memories(), Memories::default(), "round {round}");
             drop(files);
         }
         assert_eq!(names(&devices), ["one.json.broken", "one.json.broken.2"]);

@@ -35,8 +35,12 @@ pub fn everything(look: &Look, now: Time) -> News {
 }
 
 /// What has changed from one look to the next. What is only read again and is what it was before comes
-/// in `read`, with its age and nothing else.
+/// in `read`, with its age and nothing else. If a new configuration has changed what there is, all of it
+/// is told.
 pub fn changes(before: &Look, after: &Look) -> Vec<News> {
+    if names(&before.report) != names(&after.report) {
+        return vec![everything(after, after.at)];
+    }
     let mut all = Vec::new();
     let gateway = after.report.summary_json();
     if gateway != before.report.summary_json() {
@@ -53,6 +57,19 @@ pub fn changes(before: &Look, after: &Look) -> Vec<News> {
         }
     }
     all
+}
+
+/// Everything that there is, in its order: each bus, device and point, with what people call it.
+fn names(report: &GatewayReport) -> Vec<&str> {
+    let mut names = Vec::new();
+    for bus in &report.buses {
+        names.push(bus.report.name.as_str());
+        for device in &bus.report.devices {
+            names.push(&device.name);
+            names.extend(device.points.iter().flat_map(|point| [point.name.as_str(), &point.title]));
+        }
+    }
+    names
 }
 
 /// A device of a bus at the time of a look.
@@ -149,12 +166,20 @@ mod tests {
             line: None,
             up: true,
             reason: None,
+            paused: false,
             counters: Counters::default(),
             load: 0.1,
             devices: vec![device],
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
-        Look { at, report: GatewayReport { broker, buses: vec![BusHealth { report, responding: true }] } }
+        Look {
+            at,
+            report: GatewayReport {
+                broker,
+                buses: vec![BusHealth { report, responding: true }],
+                configuration_error: None,
+            },
+        }
     }
 
     fn device(look: &mut Look) -> &mut DeviceReport {
@@ -239,6 +264,18 @@ mod tests {
         let events: Vec<&str> = told.iter().map(|news| news.event).collect();
         assert_eq!(events, ["gateway", "bus", "device", "points"]);
         assert_eq!(told[3].data["points"][1]["freshness"], "old");
+    }
+
+    #[test]
+    fn where_something_else_is_there_than_before_all_is_told() {
+        for change in [
+            |look: &mut Look| device(look).points[1].name = "rate".into(),
+            |look: &mut Look| drop(device(look).points.pop()),
+            |look: &mut Look| device(look).name = "pump".into(),
+            |look: &mut Look| look.report.buses.clear(),
+        ] {
+            check(change, &[("state", "/version", json!(env!("CARGO_PKG_VERSION")))]);
+        }
     }
 
     #[test]

@@ -84,6 +84,8 @@ pub struct BusReport {
     pub up: bool,
     /// Why the link is down.
     pub reason: Option<String>,
+    /// It is down because somebody wants it so, for a time.
+    pub paused: bool,
     pub counters: Counters,
     /// The share of the last minute in which the wire was busy, 0 to 1.
     pub load: f64,
@@ -264,6 +266,8 @@ impl ThingReport {
 pub struct GatewayReport {
     pub broker: BrokerReport,
     pub buses: Vec<BusHealth>,
+    /// Why the newest configuration is not the one that runs.
+    pub configuration_error: Option<String>,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -293,7 +297,8 @@ impl BusHealth {
     /// Nothing on this bus can be reached. One dead device is no lost bus, even if it is the only one.
     fn is_lost(&self) -> bool {
         let devices = &self.report.devices;
-        !self.report.up || (devices.len() > 1 && devices.iter().all(|device| !device.online))
+        !self.report.paused
+            && (!self.report.up || (devices.len() > 1 && devices.iter().all(|device| !device.online)))
     }
 }
 
@@ -321,7 +326,10 @@ impl GatewayReport {
         let mut devices = self.buses.iter().flat_map(|bus| &bus.report.devices);
         if !self.broker.connected || self.buses.iter().any(|bus| bus.is_lost() || !bus.responding) {
             Status::Lost
-        } else if self.broker.client_id_taken || devices.any(|device| !device.online) {
+        } else if self.broker.client_id_taken
+            || devices.any(|device| !device.online)
+            || self.buses.iter().any(|bus| bus.report.paused)
+        {
             Status::Degraded
         } else {
             Status::Ok
@@ -379,12 +387,13 @@ mod tests {
             line: None,
             up,
             reason: None,
+            paused: false,
             counters: Counters::default(),
             load: 0.123_456,
             devices: devices.collect(),
         };
         let broker = BrokerReport { connected, ..BrokerReport::default() };
-        GatewayReport { broker, buses: vec![BusHealth { report, responding }] }
+        GatewayReport { broker, buses: vec![BusHealth { report, responding }], configuration_error: None }
     }
 
     #[test]

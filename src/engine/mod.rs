@@ -41,6 +41,8 @@ pub mod topics;
 pub mod bus;
 pub mod command;
 pub mod memory;
+pub mod reload;
+pub mod request;
 pub mod upkeep;
 
 #[cfg(test)]

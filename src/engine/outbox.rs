@@ -2,6 +2,8 @@
 //! messages that are told once. The client library forgets what it has not sent when the connection
 //! breaks; this does not.
 
+mod reconfigure;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use crate::engine::homeassistant::{self, Announcement};
@@ -181,13 +183,17 @@ impl Outbox {
     pub fn connected(&mut self) {
         self.push_retained(Message::retained(self.topics.bridge_state(), ONLINE));
         let waiting = std::mem::take(&mut self.queue);
-        let mut once: Vec<Message> = waiting
-            .into_iter()
-            .filter_map(|queued| match queued {
-                Queued::Once(message) => Some(message),
-                Queued::Newest(_) | Queued::Removal(_) => None,
-            })
-            .collect();
+        let mut once: Vec<Message> = Vec::new();
+        let mut removals: Vec<Queued> = Vec::new();
+        for queued in waiting {
+            match queued {
+                Queued::Once(message) => once.push(message),
+                Queued::Removal(topic) if !self.retained.contains_key(&topic) => {
+                    removals.push(Queued::Removal(topic));
+                }
+                Queued::Newest(_) | Queued::Removal(_) => {}
+            }
+        }
         for topic in self.in_order(|_| true) {
             // A farewell goes before the announcement that it prepares.
             let (before, rest) = once.into_iter().partition(|message| message.topic == topic);
@@ -196,6 +202,7 @@ impl Outbox {
             self.queue.push_back(Queued::Newest(topic));
         }
         self.queue.extend(once.into_iter().map(Queued::Once));
+        self.queue.extend(removals);
         self.retained.values_mut().for_each(|entry| entry.queued = true);
         self.states_due_at = None;
     }

@@ -4,6 +4,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use crate::engine::address::Span;
 use crate::engine::device::{Device, PointIndex};
 use crate::engine::time::Duration;
 
@@ -247,6 +248,8 @@ pub struct DeviceSettings {
     pub device: Device,
     /// What its settings shall hold, in the file's order; each point once.
     pub wanted: Vec<Wanted>,
+    /// What a `write` request may write as it is, past the profile's rules.
+    pub raw_write: Vec<Span>,
 }
 
 /// A setting of a device, as its owner wants it.

@@ -96,9 +96,22 @@ impl Topics {
         format!("{}/{device}/{point}/outcome", self.base)
     }
 
+    /// Where programs ask the gateway for something.
+    pub fn request(&self, verb: &str) -> String {
+        format!("{}/bridge/request/{verb}", self.base)
+    }
+
+    /// How a request ended; not retained.
+    pub fn response(&self, verb: &str) -> String {
+        format!("{}/bridge/response/{verb}", self.base)
+    }
+
     /// The filters to subscribe to, so that everything [`Topics::parse`] knows arrives.
     pub fn subscriptions(&self) -> Vec<String> {
-        ["+/+/set", "+/+/get"].iter().map(|tail| format!("{}/{tail}", self.base)).collect()
+        ["+/+/set", "+/+/get", "bridge/request/+"]
+            .iter()
+            .map(|tail| format!("{}/{tail}", self.base))
+            .collect()
     }
 
     /// What a message on `topic` asks for; `None` if it is none of our business.

@@ -12,7 +12,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
     &["modbus", "plan", "schedule"],
     &["identity", "state"],
     &["topics", "health", "feed", "homeassistant", "outbox", "connection"],
-    &["command", "memory", "upkeep", "bus"],
+    &["command", "memory", "upkeep", "request", "reload", "bus"],
 ];
 
 /// What would let the engine wait, ask the time, open something, or answer differently from run to

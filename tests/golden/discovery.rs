@@ -123,6 +123,7 @@ fn payload(device: &Device, known: &[Option<i128>]) -> Value {
         unit: 1,
         device: device.clone(),
         wanted: Vec::new(),
+        raw_write: Vec::new(),
     };
     let message = announcement(&gateway, &settings, "bus", known).message();
     serde_json::from_str(&message.payload).expect("a discovery message is JSON")

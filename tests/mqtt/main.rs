@@ -3,6 +3,8 @@
 mod faults;
 mod neighbours;
 mod proxy;
+mod reload;
+mod requests;
 mod rig;
 mod secure;
 mod watching;

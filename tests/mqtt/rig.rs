@@ -152,7 +152,7 @@ pub struct Gateway {
     child: Child,
     log: Arc<(Mutex<Vec<String>>, Condvar)>,
     http: String,
-    _folder: TempDir,
+    folder: TempDir,
 }
 
 impl Gateway {
@@ -169,12 +169,7 @@ impl Gateway {
     /// The same with more variables in its environment.
     pub fn start_in(environment: &[(&str, &str)], rest: &str) -> Gateway {
         let folder = tempfile::tempdir().expect("a folder");
-        let file = folder.path().join("busker.yaml");
-        let text = format!(
-            "http: {{listen: '127.0.0.1:0'}}\nstate_dir: {}\n{rest}",
-            folder.path().join("state").display()
-        );
-        fs::write(&file, text).expect("its configuration is written");
+        let file = write_configuration(&folder, rest);
         let mut child = Command::new(env!("CARGO_BIN_EXE_busker"))
             .args(["run", "--config"])
             .arg(&file)
@@ -193,7 +188,7 @@ impl Gateway {
                 lines.1.notify_all();
             }
         });
-        let gateway = Gateway { child, log, http: String::new(), _folder: folder };
+        let gateway = Gateway { child, log, http: String::new(), folder };
         gateway.listening()
     }
 
@@ -260,6 +255,27 @@ impl Gateway {
         kill_process(Pid::from_child(&self.child), Signal::CONT).expect("the signal is sent");
     }
 
+    /// Puts another configuration in the place of its own, as for [`Gateway::start_with`].
+    pub fn write(&self, rest: &str) {
+        write_configuration(&self.folder, rest);
+    }
+
+    /// The same without anything added.
+    pub fn write_whole(&self, text: &str) {
+        fs::write(self.folder.path().join("busker.yaml"), text).expect("its configuration is written");
+    }
+
+    /// Asks it to read its configuration again, and waits until it says this.
+    #[track_caller]
+    pub fn reload(&self, expected: &str) {
+        let before = self.log().len();
+        kill_process(Pid::from_child(&self.child), Signal::HUP).expect("the signal is sent");
+        let find =
+            |lines: &mut Vec<String>| lines.iter().skip(before).find(|line| line.contains(expected)).cloned();
+        let found = wait_on(&self.log, find);
+        assert!(found.is_some(), "`{expected}` is not in the log:\n{}", self.log().join("\n"));
+    }
+
     /// Asks it to end, and waits until it has.
     pub fn terminate(mut self) -> ExitStatus {
         let pid = Pid::from_child(&self.child);
@@ -272,6 +288,14 @@ impl Gateway {
         self.child.kill().expect("it is killed");
         self.child.wait().expect("it has ended");
     }
+}
+
+fn write_configuration(folder: &TempDir, rest: &str) -> PathBuf {
+    let file = folder.path().join("busker.yaml");
+    let state = folder.path().join("state");
+    let text = format!("http: {{listen: '127.0.0.1:0'}}\nstate_dir: {}\n{rest}", state.display());
+    fs::write(&file, text).expect("its configuration is written");
+    file
 }
 
 impl Drop for Gateway {

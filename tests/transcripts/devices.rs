@@ -11,8 +11,10 @@ use busker::engine::settings::{
 };
 use busker::engine::time::Duration;
 use busker::engine::value::Decimal;
+use busker::engine::yaml::Scalar;
 
 /// Reads the header: `device …` lines, `setting DEVICE POINT VALUE` with `enforced` behind it perhaps,
+/// `raw-write DEVICE SPAN`,
 /// and `tcp`, `discovery` or `stop feeding` by themselves.
 pub fn settings(header: &str) -> Settings {
     let mut devices = Vec::new();
@@ -26,6 +28,7 @@ pub fn settings(header: &str) -> Settings {
                 unit: unit.parse().expect("a unit"),
                 device: device(kind),
                 wanted: Vec::new(),
+                raw_write: Vec::new(),
             });
         }
         if let ["setting", name, point, value, ref enforced @ ..] = words[..] {
@@ -34,6 +37,13 @@ pub fn settings(header: &str) -> Settings {
             let point = device.device.points.iter().position(|known| known.name == point).expect("a point");
             let enforce = matches!(enforced, ["enforced"]);
             device.wanted.push(Wanted { point, value: value.into(), enforce });
+        }
+    }
+    for line in header.lines() {
+        if let Some((name, span)) = line.strip_prefix("raw-write ").and_then(|rest| rest.split_once(' ')) {
+            let device = devices.iter_mut().find(|device: &&mut DeviceSettings| device.name == name);
+            let span = <Span as Scalar>::parse(span).expect("a span");
+            device.expect("a device of a line before").raw_write.push(span);
         }
     }
     let says = |wanted: &str| header.lines().any(|line| line == wanted);

@@ -7,7 +7,9 @@ use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Action, Bus, Command, Event, Severity};
 use busker::engine::memory::{Memories, Memory, Record};
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
-use busker::engine::time::{Duration, Time};
+use busker::engine::profile::Library;
+use busker::engine::request::{Decision, Desk};
+use busker::engine::time::{Date, Duration, Time};
 
 use crate::devices;
 
@@ -41,6 +43,7 @@ fn timed(line: &str) -> Option<(Time, &str)> {
 
 struct Player {
     bus: Bus,
+    desk: Desk,
     header: String,
     /// What has been stored.
     memories: Memories,
@@ -62,9 +65,12 @@ const LATENCY: Duration = Duration::from_millis(9);
 impl Player {
     fn new(header: &str) -> Player {
         let memories = Memories::default();
-        let bus = Bus::new(Time::default(), &devices::settings(header), 0, &memories);
+        let settings = devices::settings(header);
+        let bus = Bus::new(Time::default(), &settings, 0, &memories);
+        let desk = Desk::new(&settings, Library::shipped());
         let mut player = Player {
             bus,
+            desk,
             header: header.to_string(),
             memories,
             text: header.to_string(),
@@ -124,6 +130,22 @@ impl Player {
             "get" => {
                 let (device, point) = rest.split_once('/').expect("device/point");
                 self.bus.handle(self.now, Event::Get { device: device.into(), point: point.into() });
+            }
+            "request" => {
+                let (verb, payload) = rest.split_once(' ').unwrap_or((rest, ""));
+                // 2026-01-01 00:00:00 UTC, and as long after it as the transcript runs.
+                let today = Date(1_767_225_600 + self.now.0 / 1_000_000);
+                match self.desk.take(today, verb, payload, false) {
+                    Decision::Ask(_, request) => self.bus.handle(self.now, Event::Request(request)),
+                    Decision::Answer(message) => self.write(&format!("answer {}", message.payload)),
+                    other => panic!("{other:?}"),
+                }
+            }
+            "retire" => self.bus.handle(self.now, Event::Retire(rest.into())),
+            // A header line, `device NAME UNIT KIND`.
+            "adopt" => {
+                let devices = devices::settings(rest).devices;
+                self.bus.handle(self.now, Event::Adopt(devices, self.memories.clone()));
             }
             "answer" => self.answer(rest),
             "devices-answer" => self.answering = true,
@@ -220,7 +242,9 @@ impl Player {
         }
     }
 
-    /// `0001 0002`, `silence`, `checksum`, `wrong-frame`, `exception 2`, `written`, `names A B`
+    /// `0001 0002`, `silence`, `checksum`, `wrong-frame`, `exception 2`, `written`, `names A, B`, `regular A, B`
+    /// (of a device that has more than the basic names, of which these are the next), `echo A537`,
+    /// `server-id 0102`
     fn answer(&mut self, text: &str) {
         let Some((request, sent_at, _)) = self.in_flight.take() else {
             return self.write("WRONG: nothing is in flight");
@@ -231,14 +255,19 @@ impl Player {
             ("wrong-frame", _) => Err(RequestError::WrongFrame),
             ("exception", code) => Err(RequestError::Exception(code.parse().expect("a code"))),
             ("written", _) => Ok(Answer::Written),
-            ("names", names) => {
+            (kind @ ("names" | "regular"), names) => {
+                let Call::ReadIdentification { object, .. } = request.call else {
+                    return self.write("WRONG: nobody asked for names");
+                };
                 let objects = names.split(", ").enumerate();
                 Ok(Answer::Identification(busker::engine::modbus::Identification {
-                    conformity: 1,
+                    conformity: if kind == "names" { 1 } else { 0x82 },
                     next: None,
-                    objects: objects.map(|(id, name)| (id as u8, name.to_string())).collect(),
+                    objects: objects.map(|(id, name)| (object + id as u8, name.to_string())).collect(),
                 }))
             }
+            ("echo", word) => Ok(Answer::Diagnostics(vec![u16::from_str_radix(word, 16).expect("a word")])),
+            ("server-id", byte) => Ok(Answer::ServerId(vec![u8::from_str_radix(byte, 16).expect("a byte")])),
             _ => match words(&request, text) {
                 Some(answer) => Ok(answer),
                 None => return self.write(&format!("WRONG: not an answer to {}", request.call)),
@@ -284,7 +313,16 @@ impl Player {
                 }
                 Answer::Written
             }
-            other => panic!("devices do not answer {other} by themselves"),
+            Call::WriteRegisters { address, words } => {
+                for (at, word) in (address..).zip(words) {
+                    self.registers.insert((unit, Table::Holding, at), word);
+                }
+                Answer::Written
+            }
+            // They know no other function.
+            Call::ReadIdentification { .. } | Call::ReportServerId | Call::Diagnostics { .. } => {
+                return self.reply(sent_at, Err(RequestError::Exception(1)));
+            }
         };
         self.reply(sent_at, Ok(answer));
     }

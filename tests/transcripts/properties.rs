@@ -4,14 +4,18 @@ use busker::engine::address::Span;
 use busker::engine::bus::{Action, Bus, Command, Event};
 use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Identification, Reply, Request, RequestError};
-use busker::engine::time::{Duration, Time};
+use busker::engine::profile::Library;
+use busker::engine::request::{Decision, Desk};
+use busker::engine::settings::{DeviceSettings, Settings};
+use busker::engine::time::{Date, Duration, Time};
 use proptest::prelude::*;
 
 use crate::devices;
 
 const DEVICES: &str = "device relays 1 relays\ndevice meter 2 selectable\ndevice board 3 clamping\n\
     device holes 4 holes\ndevice cellar 5 identified\ndiscovery\n\
-    setting relays watchdog 0.02\nsetting relays relay_1_default ON enforced\nsetting meter mode voltage enforced\n";
+    setting relays watchdog 0.02\nsetting relays relay_1_default ON enforced\nsetting meter mode voltage enforced\n\
+    raw-write relays holding 60..70\nraw-write board holding 0..9\n";
 const COMMANDS: [(&str, &str, &str); 9] = [
     ("relays", "relay_1", "ON"),
     ("relays", "relay_1_default", "ON"),
@@ -24,11 +28,29 @@ const COMMANDS: [(&str, &str, &str); 9] = [
     ("cellar", "level", "1"),
 ];
 
+const REQUESTS: [(&str, &str); 12] = [
+    ("read", r#"{"device":"meter","at":"input 0..3"}"#),
+    ("read", r#"{"device":"relays","at":"holding 1..66"}"#),
+    ("read", r#"{"device":"nobody","at":"holding 1"}"#),
+    ("write", r#"{"device":"relays","at":"holding 66","value":7}"#),
+    ("write", r#"{"device":"board","at":"holding 1..2","value":[1,2]}"#),
+    ("write", r#"{"device":"holes","at":"holding 1","value":1}"#),
+    ("identify", r#"{"device":"cellar"}"#),
+    ("diagnostics", r#"{"device":"holes"}"#),
+    ("refresh", r#"{"device":"meter"}"#),
+    ("scan", r#"{"bus":"basement","units":"4..9"}"#),
+    ("pause", r#"{"bus":"basement","for":"2s"}"#),
+    ("pause", r#"{"bus":"basement","for":"0s"}"#),
+];
+
 #[derive(Clone, Debug)]
 enum Happening {
     /// The request in flight ends so; without one, nothing.
     Ends(End),
     Command(usize),
+    Request(usize),
+    /// The configuration of a device changes: it leaves, and comes again when it has left.
+    Changed(usize),
     LinkDown,
     LinkUp,
     Time(u16),
@@ -50,6 +72,8 @@ fn happening() -> impl Strategy<Value = Happening> {
         1 => Just(Happening::Ends(End::Silence)),
         1 => Just(Happening::Ends(End::Checksum)),
         3 => (0..COMMANDS.len()).prop_map(Happening::Command),
+        3 => (0..REQUESTS.len()).prop_map(Happening::Request),
+        1 => (0usize..5).prop_map(Happening::Changed),
         1 => Just(Happening::LinkDown),
         2 => Just(Happening::LinkUp),
         4 => (0u16..2000).prop_map(Happening::Time),
@@ -65,6 +89,8 @@ fn answer(request: &Request, word: u16) -> Answer {
             let objects = vec![(0, "ACME".to_string()), (1, product.to_string())];
             Answer::Identification(Identification { conformity: 1, next: None, objects })
         }
+        Call::Diagnostics { .. } => Answer::Diagnostics(vec![word]),
+        Call::ReportServerId => Answer::ServerId(vec![word as u8]),
         _ => Answer::Written,
     }
 }
@@ -81,6 +107,11 @@ struct Observed {
     outcomes: usize,
     /// Commands sent to points that exist.
     commands: usize,
+    settings: Settings,
+    leaving: Vec<DeviceSettings>,
+    desk: Desk,
+    requests: usize,
+    responses: usize,
 }
 
 impl Observed {
@@ -92,6 +123,9 @@ impl Observed {
                     self.in_flight = Some(request);
                 }
                 Action::Publish(message) if message.topic.ends_with("/outcome") => self.outcomes += 1,
+                Action::Publish(message) if message.topic.contains("/response/") => {
+                    self.responses += usize::from(!message.payload.contains(r#""status":"progress""#));
+                }
                 _ => {}
             }
         }
@@ -99,6 +133,12 @@ impl Observed {
 
     fn handle(&mut self, event: Event) {
         self.bus.handle(self.now, event);
+        self.take_actions();
+        let bus = &self.bus;
+        let is_gone = |device: &DeviceSettings| !bus.has_device(&device.name);
+        let (gone, leaving) = std::mem::take(&mut self.leaving).into_iter().partition(is_gone);
+        self.leaving = leaving;
+        self.bus.handle(self.now, Event::Adopt(gone, Memories::default()));
         self.take_actions();
     }
 
@@ -133,6 +173,24 @@ impl Observed {
                     payload: payload.into(),
                     retained: false,
                 }));
+            }
+            Happening::Request(index) => {
+                let (verb, payload) = REQUESTS[*index];
+                match self.desk.take(Date(0), verb, payload, false) {
+                    Decision::Ask(_, request) => {
+                        self.requests += 1;
+                        self.handle(Event::Request(request));
+                    }
+                    Decision::Answer(_) => {}
+                    other => panic!("{other:?}"),
+                }
+            }
+            Happening::Changed(index) => {
+                let device = &self.settings.devices[*index];
+                if !self.leaving.contains(device) {
+                    self.leaving.push(device.clone());
+                }
+                self.handle(Event::Retire(device.name.clone()));
             }
             Happening::LinkDown => {
                 self.in_flight = None;
@@ -170,11 +228,22 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
 
     #[test]
-    fn each_command_has_one_outcome_and_one_request_is_in_flight(
+    fn each_command_and_each_request_has_one_answer_and_one_question_is_in_flight(
         happenings in prop::collection::vec(happening(), 1..300),
     ) {
-        let bus = Bus::new(Time::default(), &devices::settings(DEVICES), 0, &Memories::default());
-        let mut observed = Observed { bus, now: Time::default(), in_flight: None, outcomes: 0, commands: 0 };
+        let settings = devices::settings(DEVICES);
+        let mut observed = Observed {
+            bus: Bus::new(Time::default(), &settings, 0, &Memories::default()),
+            now: Time::default(),
+            in_flight: None,
+            outcomes: 0,
+            commands: 0,
+            desk: Desk::new(&settings, Library::default()),
+            requests: 0,
+            responses: 0,
+            leaving: Vec::new(),
+            settings,
+        };
         observed.take_actions();
         observed.play(&Happening::LinkUp);
         for happening in &happenings {
@@ -186,5 +255,6 @@ proptest! {
         }
         prop_assert!(observed.bus.is_finished());
         prop_assert_eq!(observed.outcomes, observed.commands);
+        prop_assert_eq!(observed.responses, observed.requests);
     }
 }

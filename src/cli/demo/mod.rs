@@ -67,7 +67,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let mut mosquitto = Mosquitto::start(args.mqtt)?;
     let settings = settings(&lines, mosquitto.address(), args.http)?;
     let mut screen = Screen::new(&settings, &mosquitto);
-    let app = App::start(settings, StateFiles::nowhere())?;
+    let app = App::start(settings, Library::shipped(), StateFiles::nowhere())?;
     let outcome = show(&runtime, &mut stop, &lines, &mut mosquitto, &app, &mut screen);
     app.stop();
     mosquitto.stop();

@@ -73,6 +73,15 @@ impl Http {
         self.address
     }
 
+    /// Stops, and waits until the address is free again.
+    pub async fn finish(self) {
+        for task in self.tasks {
+            task.abort();
+            // It ends with an error, since it was told to.
+            let _ = task.await;
+        }
+    }
+
     pub fn stop(self) {
         self.tasks.iter().for_each(JoinHandle::abort);
     }

@@ -15,7 +15,7 @@ use super::{Bus, Command, Purpose, Severity};
 
 /// A command that has begun.
 pub(super) struct Active {
-    device: usize,
+    pub(super) device: usize,
     target: Target,
     wanted: String,
     flow: CommandFlow,
@@ -65,6 +65,7 @@ impl Bus {
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
         self.end_settling("written, but not read back: busker stops");
+        self.refuse_requests();
         if self.in_flight.is_none() {
             for device in &mut self.devices {
                 device.say_offline(&mut self.context);
@@ -74,7 +75,16 @@ impl Bus {
 
     /// Nothing can be read back any more.
     pub(super) fn end_settling(&mut self, reason: &str) {
-        for (_, active) in std::mem::take(&mut self.settling) {
+        self.end_settling_of(None, reason);
+    }
+
+    /// The same for one device; `None` for all.
+    pub(super) fn end_settling_of(&mut self, device: Option<usize>, reason: &str) {
+        let is_of_it = |active: &Active| device.is_none_or(|device| active.device == device);
+        let all = std::mem::take(&mut self.settling).into_iter();
+        let (ended, rest): (Vec<_>, Vec<_>) = all.partition(|(_, active)| is_of_it(active));
+        self.settling = rest;
+        for (_, active) in ended {
             let outcome = Outcome::new(OutcomeKind::NoReply, &active.wanted, reason);
             self.end_command(active, outcome);
         }
@@ -220,7 +230,7 @@ impl Bus {
         }
     }
 
-    fn tell_outcome(&mut self, device: usize, target: Target, outcome: Outcome) {
+    pub(super) fn tell_outcome(&mut self, device: usize, target: Target, outcome: Outcome) {
         if matches!(target, Target::Setting(_)) {
             return;
         }

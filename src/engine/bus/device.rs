@@ -6,6 +6,7 @@ mod keeping;
 mod obeying;
 mod patience;
 mod reporting;
+mod requested;
 mod telling;
 mod wear;
 
@@ -76,6 +77,8 @@ pub(super) struct DeviceState {
     beats: Beats,
     /// When the points that tell events last did.
     happened: BTreeMap<PointIndex, Time>,
+    /// The configuration knows it no more, or knows it otherwise: nothing more is begun with it.
+    pub(super) is_leaving: bool,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -126,6 +129,7 @@ impl DeviceState {
             told_things: vec![None; settings.device.things.len()],
             beats: Beats::new(&settings.device),
             happened: BTreeMap::new(),
+            is_leaving: false,
             settings,
         }
     }
@@ -320,7 +324,7 @@ impl DeviceState {
         self.tell_info(context);
     }
 
-    fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
+    pub(super) fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         self.patience.unanswered();
         self.paused_until = now + self.patience.pause(self.asked_timeout, self.settings.unit);
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {

@@ -12,7 +12,7 @@ use super::{Bus, Purpose};
 
 /// One point that is being fetched.
 pub(super) struct Fetch {
-    device: usize,
+    pub(super) device: usize,
     point: PointIndex,
     steps: VecDeque<Step>,
     words: Vec<u16>,

@@ -2,11 +2,14 @@
 //!
 //! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
 //! `ask_next` chooses the next: the command that has begun, heartbeats that are late, waiting commands,
-//! heartbeats, what somebody asked for, settings that are not as they are wanted, then whichever device's read (or identification) is most urgent.
+//! heartbeats, what somebody asked for, settings that are not as they are wanted, a scan, then whichever device's read (or identification) is most urgent.
 
+mod change;
 mod commands;
 mod device;
 mod fetch;
+mod pause;
+mod requests;
 mod waiting;
 
 use std::collections::VecDeque;
@@ -17,13 +20,15 @@ use crate::engine::homeassistant::Gateway;
 use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Cost;
-use crate::engine::settings::{Link, OnBrokerLoss, Settings};
+use crate::engine::request;
+use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settings};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
 use commands::Active;
 use device::{DeviceState, Polled};
 use fetch::Fetch;
+use requests::Requests;
 use waiting::{Target, WaitingCommands};
 
 /// After so many requests in a row that nobody answers, a TCP connection is made anew.
@@ -43,6 +48,12 @@ pub enum Event {
         device: String,
         point: String,
     },
+    /// A program asks something.
+    Request(request::Request),
+    /// The device of this name leaves the bus: [`Bus::has_device`].
+    Retire(String),
+    /// Devices come to the bus, with what is remembered of them.
+    Adopt(Vec<DeviceSettings>, Memories),
     BrokerUp,
     BrokerDown,
     /// The time of [`Bus::wake_at`] has come.
@@ -93,6 +104,7 @@ pub struct Bus {
     link: Link,
     response_timeout: Duration,
     on_broker_loss: OnBrokerLoss,
+    eeprom: Eeprom,
     context: Context,
     devices: Vec<DeviceState>,
     waiting: WaitingCommands,
@@ -104,6 +116,7 @@ pub struct Bus {
     beat: Option<(usize, PointIndex, Call)>,
     /// Points that are read only because somebody asked for them.
     fetches: VecDeque<Fetch>,
+    requests: Requests,
     /// A setting has just been written: what is due to be read comes before the next one.
     wrote_setting: bool,
     in_flight: Option<InFlight>,
@@ -145,11 +158,16 @@ enum LinkState {
         reason: Option<String>,
         attempts: u32,
     },
+    /// Left to somebody else for a time.
+    Paused {
+        reason: String,
+    },
 }
 
 /// What the request on the wire is for.
 struct InFlight {
-    device: usize,
+    /// `None`: a unit that is no device of this gateway.
+    device: Option<usize>,
     purpose: Purpose,
     sent_at: Time,
 }
@@ -164,6 +182,9 @@ enum Purpose {
     /// Reads what the heartbeat repeats.
     BeatRead(PointIndex),
     BeatWrite(PointIndex),
+    /// A question of the request that has begun.
+    Request,
+    Scan(Call),
 }
 
 impl Bus {
@@ -178,8 +199,7 @@ impl Bus {
             bus_name: bus.name.clone(),
             republish: settings.republish,
         };
-        // Until a device's own latency is measured.
-        let cost = Cost::of(&bus.link, Duration::from_millis(5));
+        let cost = cost(&bus.link);
         let of_bus = settings.devices.iter().filter(|device| device.bus == index);
         let mut devices: Vec<DeviceState> =
             of_bus.map(|device| DeviceState::new(device.clone(), cost, settings.eeprom)).collect();
@@ -193,6 +213,7 @@ impl Bus {
             link: bus.link.clone(),
             response_timeout: bus.response_timeout,
             on_broker_loss: settings.on_broker_loss,
+            eeprom: settings.eeprom,
             context,
             devices,
             waiting: WaitingCommands::default(),
@@ -200,6 +221,7 @@ impl Bus {
             settling: Vec::new(),
             beat: None,
             fetches: VecDeque::new(),
+            requests: Requests::default(),
             wrote_setting: false,
             in_flight: None,
             link_state: LinkState::Down { reason: None, attempts: 0 },
@@ -221,17 +243,23 @@ impl Bus {
             Event::Reply(reply) => self.reply(reply),
             Event::Command(command) => self.command(command),
             Event::Get { device, point } => self.get(&device, &point),
+            Event::Request(request) => self.request(request),
+            Event::Retire(device) => self.retire(&device),
+            Event::Adopt(devices, memories) => self.adopt(devices, &memories),
             Event::BrokerUp => self.broker_up = true,
             Event::BrokerDown => self.broker_up = false,
             Event::Wake => {}
             Event::Shutdown => self.stopping = true,
         }
+        self.end_retirements();
         self.expire_commands();
+        self.expire_requests();
         if self.stopping {
             self.refuse_what_waits();
-        } else {
+        } else if !self.begin_pause() {
             self.ask_next();
         }
+        self.end_refreshes();
         self.remember();
     }
 
@@ -245,7 +273,7 @@ impl Bus {
     pub fn wake_at(&self) -> Option<Time> {
         let records = self.devices.iter().filter_map(DeviceState::record_due_at);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
-            return records.chain(self.waiting.next_deadline()).min();
+            return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
         }
         let of_devices =
             self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
@@ -258,9 +286,15 @@ impl Bus {
             .chain(self.waiting.next_deadline())
             .chain(spared.chain(settings).filter(|at| *at > self.now))
             .chain(self.settled_at())
+            .chain(self.requests_wake_at())
+            .chain(self.requests_expire_at())
             .chain(beats)
             .chain(records)
             .min()
+    }
+
+    fn cost(&self) -> Cost {
+        cost(&self.link)
     }
 
     /// Whether a shutdown has been asked for and nothing is in flight any more.
@@ -273,6 +307,7 @@ impl Bus {
         let reason = match &self.link_state {
             LinkState::Up | LinkState::Renewing => None,
             LinkState::Down { reason, .. } => Some(reason.clone().unwrap_or("not yet open".into())),
+            LinkState::Paused { reason } => Some(reason.clone()),
         };
         BusReport {
             name: self.name.clone(),
@@ -280,6 +315,7 @@ impl Bus {
             line: self.link.line().map(|line| line.to_string()),
             up: matches!(self.link_state, LinkState::Up | LinkState::Renewing),
             reason,
+            paused: matches!(self.link_state, LinkState::Paused { .. }),
             counters: self.counters,
             load: self.load.share(now),
             devices: self.devices.iter().map(|device| device.report(now)).collect(),
@@ -295,6 +331,9 @@ impl Bus {
             LinkState::Down { attempts, .. } if attempts > 0 => {
                 self.context.say(Severity::Info, format!("bus {}: the link is back", self.name));
             }
+            LinkState::Paused { .. } => {
+                self.context.say(Severity::Info, format!("bus {}: the pause is over", self.name));
+            }
             LinkState::Down { .. } | LinkState::Up => {}
         }
         for device in &mut self.devices {
@@ -304,7 +343,7 @@ impl Bus {
 
     fn link_down(&mut self, reason: String) {
         let attempts = match &self.link_state {
-            LinkState::Up | LinkState::Renewing => 0,
+            LinkState::Up | LinkState::Renewing | LinkState::Paused { .. } => 0,
             LinkState::Down { attempts, .. } => *attempts,
         };
         if attempts == 0 {
@@ -313,15 +352,21 @@ impl Bus {
         if let Some(in_flight) = self.in_flight.take() {
             self.request_ended(in_flight, Err(RequestError::Link(reason.clone())));
         }
-        self.beat = None;
-        self.fetches.clear();
-        self.end_settling(&format!("written, but not read back: the link is down: {reason}"));
-        for device in &mut self.devices {
-            device.lose(self.now, &format!("the link is down: {reason}"), &mut self.context);
-        }
+        self.leave_link(&format!("the link is down: {reason}"));
         self.link_state = LinkState::Down { reason: Some(reason), attempts: attempts + 1 };
         let after = Duration::from_millis(500 << attempts.min(6)).min(Duration::from_secs(15));
         self.context.actions.push_back(Action::Reopen { after });
+    }
+
+    /// Nothing more can be asked, and why.
+    fn leave_link(&mut self, reason: &str) {
+        self.beat = None;
+        self.fetches.clear();
+        self.break_requests(reason);
+        self.end_settling(&format!("written, but not read back: {reason}"));
+        for device in &mut self.devices {
+            device.lose(self.now, reason, &mut self.context);
+        }
     }
 
     // What happened to a request.
@@ -330,10 +375,12 @@ impl Bus {
         let Some(in_flight) = self.in_flight.take() else { return };
         self.counters.count_result(&reply.result);
         self.counters.count_discarded(reply.discarded);
-        let device = &mut self.devices[in_flight.device];
-        device.count(self.now, &reply);
         self.load.add(in_flight.sent_at.max(reply.sent_at), self.now);
-        self.unanswered = if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
+        if let Some(device) = in_flight.device {
+            self.devices[device].count(self.now, &reply);
+            self.unanswered =
+                if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
+        }
         self.request_ended(in_flight, reply.result);
         self.renew_silent_connection();
     }
@@ -350,7 +397,11 @@ impl Bus {
     }
 
     fn request_ended(&mut self, in_flight: InFlight, result: Result<Answer, RequestError>) {
-        let device = &mut self.devices[in_flight.device];
+        if let Purpose::Scan(call) = &in_flight.purpose {
+            return self.scan_answered(call, in_flight.sent_at, &result);
+        }
+        let Some(index) = in_flight.device else { return };
+        let device = &mut self.devices[index];
         match in_flight.purpose {
             Purpose::Identify => device.identified(self.now, result, &mut self.context),
             Purpose::Poll { read } => device.polled(self.now, read, result, &mut self.context),
@@ -358,12 +409,15 @@ impl Bus {
             Purpose::Fetch => self.fetched(result),
             Purpose::BeatRead(point) => {
                 let call = device.beat_read(self.now, point, &result, &mut self.context);
-                self.beat = call.map(|call| (in_flight.device, point, call));
+                self.beat = call.map(|call| (index, point, call));
             }
             Purpose::BeatWrite(point) => {
                 self.counters.writes += 1;
                 device.beat_written(self.now, point, &result, &mut self.context);
             }
+            Purpose::Request => self.request_answered(in_flight.sent_at, result),
+            // Has been seen to.
+            Purpose::Scan(_) => {}
         }
     }
 
@@ -399,7 +453,9 @@ impl Bus {
                 || self.begin_command()
                 || self.begin_beat(false)
                 || self.next_fetch()
+                || self.begin_request()
                 || self.begin_setting()
+                || self.next_scan()
             {
                 continue;
             }
@@ -414,9 +470,10 @@ impl Bus {
                 if better { other } else { best }
             });
             let read_before_setting = std::mem::take(&mut self.wrote_setting);
+            let read_before_request = self.requests_go_on();
             let Some((device, polled, ..)) = next else {
-                // Nothing is due: the next setting need not wait for it.
-                if read_before_setting {
+                // Nothing is due: the next setting, or question of a request, need not wait for it.
+                if read_before_setting || read_before_request {
                     continue;
                 }
                 return;
@@ -440,9 +497,11 @@ impl Bus {
         true
     }
 
-    /// A device whose watchdog must run out is not spoken to while the broker is away.
+    /// Not a device that leaves. And one whose watchdog must run out is not spoken to while the broker is away.
     fn may_ask(&self, device: &DeviceState) -> bool {
-        self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog()
+        let is_to_be_fed =
+            self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog();
+        is_to_be_fed && !device.is_leaving
     }
 
     fn remember(&mut self) {
@@ -461,9 +520,21 @@ impl Bus {
         let timeout = state.timeout(self.response_timeout);
         let not_before = state.asked(self.now);
         let request = state.request(call);
-        self.in_flight = Some(InFlight { device, purpose, sent_at: not_before });
+        self.in_flight = Some(InFlight { device: Some(device), purpose, sent_at: not_before });
         self.context.actions.push_back(Action::Send { request, not_before, timeout });
     }
+
+    /// Asks a unit that is no device of this gateway.
+    fn send_stranger(&mut self, request: Request, purpose: Purpose) {
+        let (now, timeout) = (self.now, self.response_timeout);
+        self.in_flight = Some(InFlight { device: None, purpose, sent_at: now });
+        self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
+    }
+}
+
+/// What a read costs, until a device's own latency is measured.
+fn cost(link: &Link) -> Cost {
+    Cost::of(link, Duration::from_millis(5))
 }
 
 /// The share of time in which the wire is busy: two buckets of a minute.

@@ -85,6 +85,15 @@ impl WaitingCommands {
         std::mem::take(&mut self.queue)
     }
 
+    /// Puts back what [`WaitingCommands::take_all`] took.
+    pub fn put_all(&mut self, commands: Vec<Waiting>) {
+        self.queue = commands;
+    }
+
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut Waiting> {
+        self.queue.iter_mut()
+    }
+
     pub fn iter(&self) -> impl Iterator<Item = &Waiting> {
         self.queue.iter()
     }

@@ -6,6 +6,7 @@ use std::marker::PhantomData;
 
 use serde_json::json;
 
+use crate::engine::address::Span;
 use crate::engine::configuration::words::{
     BaudRate, BrokerUrl, HostPort, Listen, Name, Part, StopBits, Token, Topic, Unit,
 };
@@ -162,6 +163,9 @@ record! {
         /// What the device's settings shall hold, by the names of its points. Compared on each connect;
         /// a difference is written once for each change of this section, a later one is reported.
         settings: Option<Part<Map<String, Setting>>>,
+        /// Coils and holding registers that a `write` request on MQTT may write as they are, past the
+        /// rules of the profile: `[holding 10..19]`. None unless said.
+        raw_write: Part<Vec<Part<At<Span>>>> = Part::of(Vec::new()),
     }
 }
 

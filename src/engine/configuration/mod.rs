@@ -10,6 +10,7 @@ mod words;
 
 use std::path::PathBuf;
 
+use crate::engine::address::Span;
 use crate::engine::configuration::file::Configuration;
 use crate::engine::configuration::words::{HostPort, Listen, Name, Part, Unit};
 use crate::engine::device::Device;
@@ -374,6 +375,7 @@ impl Resolver<'_> {
             if let (Some(bus), Some(unit), Some(resolved)) = (bus, device.unit.get(), self.device(device)) {
                 let settings = read_part(&device.settings);
                 let wanted = settings.map(|settings| wanted::check(settings, &resolved, &mut self.faults));
+                let raw_write = device.raw_write.get().map(|spans| self.raw_write(spans, &resolved));
                 devices.push(DeviceSettings {
                     name: name.0.clone(),
                     title: device.name.clone().unwrap_or_else(|| title(&name.0)),
@@ -381,10 +383,39 @@ impl Resolver<'_> {
                     unit: unit.value.0,
                     device: resolved,
                     wanted: wanted.unwrap_or_default(),
+                    raw_write: raw_write.unwrap_or_default(),
                 });
             }
         }
         devices
+    }
+
+    /// What may be written as it is lies in a table that can be written, and touches nothing forbidden.
+    fn raw_write(&mut self, spans: &[Part<At<Span>>], device: &Device) -> Vec<Span> {
+        let spans = || spans.iter().filter_map(Part::get);
+        for span in spans() {
+            if !span.table().is_writable() {
+                self.faults.add(
+                    &span.place,
+                    format!("`{}` can only be read; expected spans of `coil` or `holding`", span.value),
+                );
+            }
+            for left_out in device.left_out.iter().filter(|other| other.span.overlaps(span.value)) {
+                let (found, inside, reason) = (span.value, left_out.span, &left_out.reason);
+                let message = format!("`{found}` touches `{inside}`, which the profile leaves out: {reason}");
+                self.warnings.add(&span.place, message);
+            }
+            if let Some(forbidden) =
+                device.wire.forbidden.iter().find(|other| other.span.overlaps(span.value))
+            {
+                let (found, inside, reason) = (span.value, forbidden.span, &forbidden.reason);
+                let message = format!(
+                    "`{found}` touches `{inside}`, which the profile forbids ({reason}); leave it out"
+                );
+                self.faults.add(&span.place, message);
+            }
+        }
+        spans().map(|span| span.value).collect()
     }
 
     fn device_name(&mut self, name: &At<Name>, file: &Configuration) {

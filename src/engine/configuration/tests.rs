@@ -21,6 +21,7 @@ points:
   flow: {at: input 0, poll: slow}
   mode: {at: holding 0, poll: slow, values: {0: voltage, 1: pt100}}
   level: {at: input 1, poll: fast, by: mode, is: {voltage: {unit: V}, pt100: {unit: °C}}}
+left_out: {holding 9: line settings}
 ";
 
 fn library() -> Library {
@@ -98,7 +99,7 @@ buses:
   basement: {serial: /dev/ttyUSB0, baud: 9600, parity: odd, stop_bits: 2, response_timeout: 1s, gap: 5ms}
   attic: {rtu_over_tcp: 'serial-server:4196'}
 devices:
-  pump_2: {profile: acme/ra2, bus: attic, unit: 7, poll: {fast: 250ms}}
+  pump_2: {profile: acme/ra2, bus: attic, unit: 7, poll: {fast: 250ms}, raw_write: [holding 0..9, coil 1]}
 ",
     );
     assert_eq!((settings.mqtt.host.as_str(), settings.mqtt.port), ("fe80::1", 1884));
@@ -123,11 +124,14 @@ devices:
     assert_eq!((device.title.as_str(), device.bus, device.unit), ("Pump 2", 1, 7));
     assert_eq!(device.device.wire.intervals.fast, Duration::from_millis(250));
     assert_eq!(device.device.wire.intervals.slow, Duration::from_secs(20));
+    let raw_write: Vec<String> = device.raw_write.iter().map(ToString::to_string).collect();
+    assert_eq!(raw_write, ["holding 0..9", "coil 1"]);
     assert_eq!(
         warnings,
         [
             "no device is on the bus `basement`",
             "`/dev/ttyUSB0` may be another adapter after the next start; use its path under `/dev/serial/by-id/`",
+            "`holding 0..9` touches `holding 9`, which the profile leaves out: line settings",
         ]
     );
 }

@@ -32,6 +32,8 @@ pub fn info_json(settings: &Settings) -> Value {
         "buses": buses,
         "devices": devices,
         "profiles": profiles,
+        "paused": {},
+        "configuration": {"error": null},
     })
 }
 
@@ -71,7 +73,22 @@ impl GatewayReport {
                 "waiting": self.broker.waiting,
                 "dropped": self.broker.dropped,
             },
+            "configuration": {"error": self.configuration_error},
         })
+    }
+
+    /// `bridge/info`, with what may change while the settings do not.
+    pub fn info_json(&self, settings: &Settings) -> Value {
+        let paused: Map<String, Value> = self
+            .buses
+            .iter()
+            .filter(|bus| bus.report.paused)
+            .map(|bus| (bus.report.name.clone(), bus.report.reason.clone().into()))
+            .collect();
+        let mut info = info_json(settings);
+        info["paused"] = paused.into();
+        info["configuration"] = json!({"error": self.configuration_error});
+        info
     }
 
     /// `GET /api/buses`: a list.
@@ -112,6 +129,7 @@ fn bus_json(bus: &BusHealth) -> Value {
         "line": report.line,
         "up": report.up,
         "reason": report.reason,
+        "paused": report.paused,
         "responding": bus.responding,
         "load": (report.load * 1000.0).round() / 1000.0,
     }));

@@ -263,6 +263,7 @@ mod tests {
             unit: 1,
             device,
             wanted: Vec::new(),
+            raw_write: Vec::new(),
         }
     }
 

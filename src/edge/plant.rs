@@ -1,0 +1,189 @@
+//! What runs now, for everybody who has to reach it: a new configuration exchanges it under them.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use crate::edge::bus_thread::BusHandle;
+use crate::edge::clock::Clock;
+use crate::edge::mqtt::{BrokerState, Mailbox, News};
+use crate::engine::bus::{Command, Event};
+use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::health::{BrokerReport, GatewayReport};
+use crate::engine::outbox::Outbox;
+use crate::engine::profile::Library;
+use crate::engine::request::{Decision, Desk};
+use crate::engine::settings::Settings;
+use crate::engine::topics::{Message, Topics};
+
+/// The running parts.
+pub struct Plant {
+    clock: Clock,
+    parts: Mutex<Parts>,
+}
+
+struct Parts {
+    settings: Arc<Settings>,
+    topics: Topics,
+    mailbox: Arc<Mailbox>,
+    desk: Desk,
+    /// In the order of the settings.
+    buses: Vec<Arc<BusHandle>>,
+    /// Device to bus.
+    bus_of: BTreeMap<String, usize>,
+    connection: Option<BrokerState>,
+}
+
+impl Parts {
+    fn new(settings: Settings, library: Library) -> Parts {
+        let topics = Topics::new(&settings.mqtt.base_topic);
+        let outbox =
+            Outbox::new(topics.clone(), &settings.home_assistant.prefix, identities(&settings, &topics));
+        Parts {
+            desk: Desk::new(&settings, library),
+            topics,
+            mailbox: Arc::new(Mailbox::new(outbox)),
+            buses: Vec::new(),
+            bus_of: bus_of(&settings),
+            connection: None,
+            settings: Arc::new(settings),
+        }
+    }
+}
+
+/// Everything that Home Assistant may know of this gateway.
+pub fn identities(settings: &Settings, topics: &Topics) -> Vec<String> {
+    let buses = settings.buses.iter().map(|bus| topics.bus_identity(&bus.name));
+    let devices = settings.devices.iter().map(|device| topics.identity(&device.name));
+    buses.chain(devices).chain([topics.bridge_identity()]).collect()
+}
+
+fn bus_of(settings: &Settings) -> BTreeMap<String, usize> {
+    settings.devices.iter().map(|device| (device.name.clone(), device.bus)).collect()
+}
+
+impl Plant {
+    /// As these settings want it, but with nothing running yet.
+    pub fn new(settings: Settings, library: Library, clock: Clock) -> Plant {
+        Plant { clock, parts: Mutex::new(Parts::new(settings, library)) }
+    }
+
+    /// The same once more, with an empty mailbox.
+    pub fn begin_anew(&self, settings: Settings, library: Library) {
+        *self.parts() = Parts::new(settings, library);
+    }
+
+    /// The same mailbox and connection, and other settings.
+    pub fn exchange(&self, settings: Settings, library: Library, buses: Vec<Arc<BusHandle>>) {
+        let mut parts = self.parts();
+        parts.desk = Desk::new(&settings, library);
+        parts.bus_of = bus_of(&settings);
+        parts.settings = Arc::new(settings);
+        parts.buses = buses;
+    }
+
+    pub fn set_buses(&self, buses: Vec<Arc<BusHandle>>) {
+        self.parts().buses = buses;
+    }
+
+    pub fn set_connection(&self, connection: BrokerState) {
+        self.parts().connection = Some(connection);
+    }
+
+    pub fn settings(&self) -> Arc<Settings> {
+        self.parts().settings.clone()
+    }
+
+    pub fn mailbox(&self) -> Arc<Mailbox> {
+        self.parts().mailbox.clone()
+    }
+
+    pub fn topics(&self) -> Topics {
+        self.parts().topics.clone()
+    }
+
+    pub fn buses(&self) -> Vec<Arc<BusHandle>> {
+        self.parts().buses.clone()
+    }
+
+    pub fn broker(&self) -> BrokerReport {
+        let connection = self.parts().connection.clone();
+        connection.map(|connection| connection.report()).unwrap_or_default()
+    }
+
+    /// `bridge/info` as it is with this report.
+    pub fn info(&self, report: &GatewayReport) -> Message {
+        let parts = self.parts();
+        Message::retained(parts.topics.bridge_info(), report.info_json(&parts.settings).to_string())
+    }
+
+    fn parts(&self) -> MutexGuard<'_, Parts> {
+        // The parts are whole after every call, whoever panicked meanwhile.
+        self.parts.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Brings what the broker tells to the buses that it concerns.
+    pub fn tell(&self, news: News) {
+        let mut parts = self.parts();
+        match news {
+            News::Up => parts.tell_all(&Event::BrokerUp),
+            News::Down => parts.tell_all(&Event::BrokerDown),
+            News::Get { device, point } => {
+                parts.tell_bus_of(&device.clone(), Event::Get { device, point });
+            }
+            News::Request { verb, payload, retained, stale } => {
+                let decision = match stale {
+                    Some(reason) if !retained => parts.desk.refuse(&verb, &payload, &reason),
+                    _ => parts.desk.take(self.clock.today(), &verb, &payload, retained),
+                };
+                parts.carry_out(decision);
+            }
+            News::Set { device, point, payload, retained } => {
+                let refused = Outcome::new(OutcomeKind::Refused, &payload, "too many commands wait");
+                let topic = parts.topics.outcome(&device, &point);
+                let command = Command { device: device.clone(), point, payload, retained };
+                if !parts.tell_bus_of(&device, Event::Command(command)) {
+                    parts.mailbox.push(Message::once(topic, refused.to_json()));
+                }
+            }
+        }
+    }
+}
+
+impl Parts {
+    fn carry_out(&self, decision: Decision) {
+        match decision {
+            Decision::Ask(bus, request) => {
+                let taken = self.buses.get(bus).is_some_and(|bus| {
+                    let event = Event::Request(request.clone());
+                    bus.send(event).is_ok()
+                });
+                if !taken {
+                    self.mailbox.push(request.refusal(&self.topics, "too much waits for the bus"));
+                }
+            }
+            Decision::Answer(message) => self.mailbox.push(message),
+            Decision::Warn(text) => tracing::warn!("{text}"),
+            Decision::Ignore => {}
+        }
+    }
+
+    fn tell_all(&self, event: &Event) {
+        for bus in &self.buses {
+            // A bus with a full inbox is stuck, and is reported as that.
+            if bus.send(event.clone()).is_err() {
+                tracing::warn!("a bus does not take news of the broker");
+            }
+        }
+    }
+
+    /// `false` if the bus has no room for it.
+    fn tell_bus_of(&self, device: &str, event: Event) -> bool {
+        match self.bus_of.get(device).map(|bus| self.buses.get(*bus)) {
+            Some(bus) => bus.is_some_and(|bus| bus.send(event).is_ok()),
+            None => {
+                tracing::debug!("a message for `{device}`, which is no device of this gateway");
+                true
+            }
+        }
+    }
+}

@@ -1,0 +1,269 @@
+//! A new configuration while the gateway runs: only what has changed ends, begins or begins anew.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use anyhow::Context;
+
+use crate::edge::app::{
+    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, start_bus, start_buses, watched,
+};
+use crate::edge::bus_thread::BusHandle;
+use crate::edge::http::{Bound, Http};
+use crate::edge::plant::identities;
+use crate::edge::secrets::Secrets;
+use crate::edge::state_files::StateFiles;
+use crate::engine::bus::Event;
+use crate::engine::homeassistant::{self, Gateway};
+use crate::engine::profile::Library;
+use crate::engine::reload::{self, Change, Fate, Parts};
+use crate::engine::settings::{DeviceSettings, Settings};
+use crate::engine::time::Duration;
+
+/// How often a bus is asked whether a device has left it.
+const ASK_EVERY: Duration = Duration::from_millis(5);
+
+impl App {
+    /// Goes on with these settings. An error means that nothing has changed, except where it says
+    /// otherwise. Not from within a runtime.
+    pub fn reload(&mut self, settings: Settings, library: Library) -> anyhow::Result<()> {
+        // What can fail comes before what cannot.
+        let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
+        let old = self.plant.settings();
+        let change = reload::compare(&old, &settings);
+        // The same port can be taken only when it has been left.
+        let port = self.http_address().map(|address| format!(":{}", address.port()));
+        let is_its_own = |listen: &String| port.as_ref().is_some_and(|port| listen.ends_with(port));
+        let moves =
+            old.http.listen != settings.http.listen && !settings.http.listen.as_ref().is_some_and(is_its_own);
+        let listener = match &settings.http.listen {
+            Some(listen) if moves => Some(self.runtime.block_on(Http::bind(listen))?),
+            Some(_) | None => None,
+        };
+        let http_ends = old.http != settings.http || keys.token != self.keys.token;
+        let listen = settings.http.listen.clone();
+        match change {
+            Change::Everything => {
+                tracing::info!("the new configuration changes what everything is made of: all begins anew");
+                self.begin_anew(&old, settings, library, keys, secrets)?;
+            }
+            Change::Parts(parts) => {
+                if parts.is_nothing() && keys == self.keys {
+                    tracing::info!("the new configuration changes nothing that runs");
+                }
+                self.exchange(&old, settings, library, &parts)?;
+                let reconnects = parts.broker || !keys.is_same_broker(&self.keys);
+                self.keys = keys;
+                if reconnects {
+                    tracing::info!("the connection to the broker is made anew");
+                    self.reconnect(secrets);
+                }
+            }
+        }
+        if http_ends {
+            self.exchange_http(listener, listen.as_deref())?;
+        }
+        self.reporter.set_configuration_error(None);
+        Ok(())
+    }
+
+    /// The new configuration was no good, and why; everything goes on as it was.
+    pub fn refuse_reload(&self, reason: &str) {
+        self.reporter.set_configuration_error(Some(reason.into()));
+    }
+
+    fn begin_anew(
+        &mut self,
+        old: &Settings,
+        settings: Settings,
+        library: Library,
+        keys: Keys,
+        secrets: Secrets,
+    ) -> anyhow::Result<()> {
+        self.reporter.replace(Vec::new());
+        end_buses(&self.runtime, self.plant.buses());
+        self.plant.mailbox().change(|outbox| outbox.take_back_everything());
+        if let Some(broker) = self.broker.take() {
+            self.runtime.block_on(broker.finish());
+        }
+        let names = || settings.devices.iter().map(|device| device.name.as_str());
+        if old.state_dir == settings.state_dir {
+            self.state.learn(names());
+        } else {
+            self.state.finish();
+            self.state = Arc::new(StateFiles::open(&settings.state_dir, names())?);
+        }
+        let everyone = 0..settings.buses.len();
+        self.plant.begin_anew(settings, library);
+        introduce(&self.plant.settings(), &self.plant.topics(), &self.plant.mailbox());
+        let buses = start_buses(&self.plant, everyone, self.clock, &self.state)?;
+        self.plant.set_buses(buses.clone());
+        self.keys = keys;
+        let _inside = self.runtime.enter();
+        self.broker = Some(connect(&self.plant, secrets, self.clock));
+        self.reporter.replace(watched(&self.plant.settings(), &buses, self.clock, &self.state));
+        Ok(())
+    }
+
+    fn exchange(
+        &mut self,
+        old: &Settings,
+        settings: Settings,
+        library: Library,
+        parts: &Parts,
+    ) -> anyhow::Result<()> {
+        let before = old.buses.iter().map(|bus| bus.name.clone()).zip(self.plant.buses());
+        let mut running: BTreeMap<String, Arc<BusHandle>> = before.collect();
+        let stays = |name: &str| {
+            let mut fates = parts.buses.iter();
+            fates.any(|(bus, fate)| bus == name && matches!(fate, Fate::Stays { .. }))
+        };
+        // Nobody asks a bus that is about to end, and takes its silence for a fault.
+        self.reporter.keep(stays);
+        let ending: Vec<String> = running.keys().filter(|name| !stays(name)).cloned().collect();
+        let ended = ending.iter().filter_map(|name| running.remove(name)).collect();
+        end_buses(&self.runtime, ended);
+        for (name, fate) in &parts.buses {
+            if let (Fate::Stays { leave, .. }, Some(bus)) = (fate, running.get(name)) {
+                self.retire(bus, leave);
+            }
+        }
+        self.take_back(old, &settings);
+
+        // What was on other buses may come to a bus only now that it has left those.
+        let settings_of_threads = Arc::new(settings.clone());
+        let names = settings.devices.iter().map(|device| device.name.as_str());
+        let memories = self.state.learn(names);
+        let is_connected = self.plant.broker().connected;
+        let mut buses = Vec::new();
+        for (index, (name, fate)) in parts.buses.iter().enumerate() {
+            let bus = match (fate, running.remove(name)) {
+                (Fate::Stays { come, .. }, Some(bus)) => {
+                    if !come.is_empty() {
+                        let devices = on_bus(come, index);
+                        self.hand_over(&bus, Event::Adopt(devices, memories.clone()));
+                    }
+                    bus
+                }
+                _ => {
+                    let mailbox = self.plant.mailbox();
+                    if settings.home_assistant.discovery {
+                        let gateway = Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant);
+                        mailbox.push(homeassistant::announce_bus(&gateway, name).message());
+                    }
+                    let bus = start_bus(&settings_of_threads, index, self.clock, &self.state, mailbox);
+                    let bus =
+                        bus.map_err(|error| error.context("the new configuration works only in part"))?;
+                    if !is_connected {
+                        self.hand_over(&bus, Event::BrokerDown);
+                    }
+                    bus
+                }
+            };
+            buses.push(bus);
+        }
+        let watched = watched(&settings, &buses, self.clock, &self.state);
+        self.plant.exchange(settings, library, buses);
+        self.reporter.replace(watched);
+        for (name, fate) in &parts.buses {
+            tell_fate(name, fate);
+        }
+        parts.ended.iter().for_each(|name| tracing::info!("bus {name}: gone"));
+        Ok(())
+    }
+
+    /// Lets devices leave a bus, and waits until the last of them has.
+    fn retire(&self, bus: &BusHandle, devices: &[String]) {
+        for device in devices {
+            self.hand_over(bus, Event::Retire(device.clone()));
+        }
+        let names = devices.to_vec();
+        let left = self.runtime.block_on(async {
+            tokio::time::timeout(BUSES_END_WITHIN, async {
+                loop {
+                    let names = names.clone();
+                    let is_there = move |name: &String, bus: &crate::engine::bus::Bus| bus.has_device(name);
+                    let answer = bus.inspect(move |bus, _| names.iter().any(|name| is_there(name, bus)));
+                    // A bus that has ended has no devices.
+                    if !answer.await.unwrap_or(false) {
+                        return;
+                    }
+                    tokio::time::sleep(ASK_EVERY).await;
+                }
+            })
+            .await
+        });
+        if left.is_err() {
+            tracing::warn!("a device does not leave its bus in time: {}", devices.join(", "));
+        }
+    }
+
+    fn hand_over(&self, bus: &BusHandle, event: Event) {
+        if bus.send(event).is_err() {
+            tracing::error!("a bus is stuck and does not take its new configuration; restart the gateway");
+        }
+    }
+
+    /// Takes back at the broker what the new settings do not have.
+    fn take_back(&self, old: &Settings, new: &Settings) {
+        let topics = self.plant.topics();
+        let wanted = reload::topics_of_devices(new);
+        let changed = reload::changed_devices(old, new);
+        self.plant.mailbox().change(|outbox| {
+            outbox.reconfigure(identities(new, &topics), &wanted);
+            for device in changed {
+                outbox.announced_anew(&topics.identity(&device));
+            }
+        });
+    }
+
+    fn reconnect(&mut self, secrets: Secrets) {
+        if let Some(broker) = self.broker.take() {
+            self.runtime.block_on(broker.finish());
+        }
+        let _inside = self.runtime.enter();
+        self.broker = Some(connect(&self.plant, secrets, self.clock));
+    }
+
+    fn exchange_http(&mut self, listener: Option<Bound>, listen: Option<&str>) -> anyhow::Result<()> {
+        if let Some(http) = self.http.take() {
+            self.runtime.block_on(http.finish());
+        }
+        let listener = match (listener, listen) {
+            (Some(listener), _) => Some(listener),
+            (None, Some(listen)) => {
+                let bound = self.runtime.block_on(Http::bind(listen));
+                Some(bound.context("the new configuration works only in part")?)
+            }
+            (None, None) => None,
+        };
+        let _inside = self.runtime.enter();
+        let token = self.keys.token.clone();
+        self.http = listener.map(|listener| Http::serve(listener, self.reporter.clone(), self.clock, token));
+        if let Some(address) = self.http_address() {
+            tracing::info!("HTTP on http://{address}/health");
+        }
+        Ok(())
+    }
+}
+
+fn on_bus(devices: &[DeviceSettings], bus: usize) -> Vec<DeviceSettings> {
+    devices.iter().map(|device| DeviceSettings { bus, ..device.clone() }).collect()
+}
+
+fn tell_fate(name: &str, fate: &Fate) {
+    match fate {
+        Fate::Stays { leave, come } => {
+            let come: Vec<&str> = come.iter().map(|device| device.name.as_str()).collect();
+            for device in leave.iter().filter(|device| !come.contains(&device.as_str())) {
+                tracing::info!("bus {name}: {device} is gone");
+            }
+            for device in come {
+                let changed = if leave.iter().any(|other| other == device) { "changed" } else { "new" };
+                tracing::info!("bus {name}: {device} is {changed}");
+            }
+        }
+        Fate::Restarts => tracing::info!("bus {name}: changed, and started anew"),
+        Fate::Begins => tracing::info!("bus {name}: new"),
+    }
+}

@@ -1,0 +1,92 @@
+//! Devices leave a running bus and come to it, while the others go on as if nothing had happened.
+
+use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::memory::Memories;
+use crate::engine::settings::DeviceSettings;
+
+use super::device::DeviceState;
+use super::{Action, Bus, InFlight, LinkState, Purpose};
+
+/// What commands and requests of a device are told that leaves.
+const REASON: &str = "the configuration of the device has changed";
+
+impl Bus {
+    /// The device begins nothing more, and is gone as soon as nothing of it is on the wire:
+    /// [`Bus::has_device`].
+    pub(super) fn retire(&mut self, name: &str) {
+        if let Some(index) = self.devices.iter().position(|device| device.name() == name) {
+            self.devices[index].is_leaving = true;
+            self.refuse_all_of(index);
+        }
+    }
+
+    /// Ends everything of this device that waits.
+    fn refuse_all_of(&mut self, index: usize) {
+        let (of_it, others): (Vec<_>, Vec<_>) =
+            self.waiting.take_all().into_iter().partition(|waiting| waiting.device == index);
+        self.waiting.put_all(others);
+        for waiting in of_it {
+            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, REASON);
+            self.tell_outcome(waiting.device, waiting.target, outcome);
+        }
+        self.end_settling_of(Some(index), &format!("written, but not read back: {REASON}"));
+        self.refuse_requests_of(index, REASON);
+        self.beat = self.beat.take().filter(|(device, ..)| *device != index);
+        // The answer to the one under way, which is the first, still comes.
+        let is_under_way = |in_flight: &InFlight| matches!(in_flight.purpose, Purpose::Fetch);
+        let kept = usize::from(self.in_flight.as_ref().is_some_and(is_under_way));
+        let rest = self.fetches.split_off(kept.min(self.fetches.len()));
+        self.fetches.extend(rest.into_iter().filter(|fetch| fetch.device != index));
+    }
+
+    /// Whether the device is here, if only until the question on the wire has been answered.
+    pub fn has_device(&self, name: &str) -> bool {
+        self.devices.iter().any(|device| device.name() == name)
+    }
+
+    /// Lets go of the devices that leave and have nothing on the wire any more.
+    pub(super) fn end_retirements(&mut self) {
+        let asked = self.in_flight.as_ref().and_then(|in_flight| in_flight.device);
+        let commanded = self.active.as_ref().map(|active| active.device);
+        for index in (0..self.devices.len()).rev() {
+            let is_busy = asked == Some(index) || commanded == Some(index);
+            if is_busy || !self.devices[index].is_leaving {
+                continue;
+            }
+            // What has come since it was told to leave, or waits to be read back.
+            self.refuse_all_of(index);
+            let mut device = self.devices.remove(index);
+            if let Some(record) = device.record(self.now, true) {
+                self.context.actions.push_back(Action::Store(record));
+            }
+            self.renumber(|other| if other > index { other - 1 } else { other });
+        }
+    }
+
+    /// Everything that names a device by its number; nothing names one that is gone.
+    fn renumber(&mut self, new: impl Fn(usize) -> usize) {
+        let change = |device: &mut usize| *device = new(*device);
+        if let Some(device) = self.in_flight.as_mut().and_then(|in_flight| in_flight.device.as_mut()) {
+            change(device);
+        }
+        self.active.iter_mut().for_each(|active| change(&mut active.device));
+        self.settling.iter_mut().for_each(|(_, active)| change(&mut active.device));
+        self.beat.iter_mut().for_each(|(device, ..)| change(device));
+        self.waiting.iter_mut().for_each(|waiting| change(&mut waiting.device));
+        self.fetches.iter_mut().for_each(|fetch| change(&mut fetch.device));
+        self.requests.devices().for_each(change);
+    }
+
+    /// These devices come, as at the start of the bus.
+    pub(super) fn adopt(&mut self, devices: Vec<DeviceSettings>, memories: &Memories) {
+        for settings in devices {
+            let mut device = DeviceState::new(settings, self.cost(), self.eeprom);
+            self.counters.persistent_writes += device.recall(memories);
+            device.introduce(self.now, &mut self.context);
+            if self.link_state == LinkState::Up {
+                device.reconnect(self.now);
+            }
+            self.devices.push(device);
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! What becomes of retained topics when the configuration changes while the gateway runs.
+
+use std::collections::BTreeSet;
+
+use crate::engine::homeassistant::Announcement;
+use crate::engine::topics;
+
+use super::{Outbox, Queued, Rank};
+
+impl Outbox {
+    /// The gateway has something else now: `identities` as for [`Outbox::new`], and on `wanted` its devices
+    /// tell something. What it has told of anything else is taken back at the broker.
+    pub fn reconfigure(&mut self, identities: impl IntoIterator<Item = String>, wanted: &BTreeSet<String>) {
+        let prefix = self.discovery_prefix.trim_end_matches("/device/").to_string();
+        let own = identities.into_iter().map(|identity| topics::discovery(&prefix, &identity));
+        self.own_devices = own.collect();
+        let of_devices = self.in_order(|rank| !matches!(rank, Rank::Bridge | Rank::BridgeState));
+        for topic in of_devices {
+            if self.rank(&topic) == Rank::Discovery {
+                if !self.own_devices.contains(&topic) {
+                    self.take_back_announcement(&topic);
+                }
+            } else if !wanted.contains(&topic) {
+                self.take_back(topic);
+            }
+        }
+        let own = &self.own_devices;
+        self.remembered.retain(|topic, _| own.contains(topic));
+    }
+
+    /// Something will be announced anew: what it has no more is buried then.
+    pub fn announced_anew(&mut self, identity: &str) {
+        let prefix = self.discovery_prefix.trim_end_matches("/device/");
+        let topic = topics::discovery(prefix, identity);
+        let Some(entry) = self.retained.remove(&topic) else { return };
+        if let Some(found) = Announcement::parse(&self.topics, &topic, &entry.payload) {
+            self.remembered.insert(topic, found);
+        }
+    }
+
+    /// The gateway will be another one: nothing that it told stays at the broker, but that it is offline.
+    pub fn take_back_everything(&mut self) {
+        for topic in self.in_order(|rank| rank != Rank::BridgeState) {
+            self.take_back(topic);
+        }
+    }
+
+    fn take_back_announcement(&mut self, topic: &str) {
+        let found = self.retained.get(topic);
+        let found = found.and_then(|entry| Announcement::parse(&self.topics, topic, &entry.payload));
+        self.take_back(topic.to_string());
+        if let Some(found) = found {
+            // If Home Assistant is not there to hear it, it is told again when it starts.
+            self.departed.insert(topic.to_string(), found);
+        }
+    }
+
+    fn take_back(&mut self, topic: String) {
+        self.retained.remove(&topic);
+        self.queue.push_back(Queued::Removal(topic));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::topics::{Message, Topics};
+
+    fn outbox() -> Outbox {
+        let identities = ["busker_bridge", "busker_boiler", "busker_pump"].map(String::from);
+        let mut outbox = Outbox::new(Topics::new("busker"), "homeassistant", identities);
+        for (topic, payload) in [
+            ("busker/bridge/info", "{}"),
+            ("homeassistant/device/busker_bridge/config", "{}"),
+            ("homeassistant/device/busker_boiler/config", "{}"),
+            ("homeassistant/device/busker_pump/config", "{}"),
+            ("busker/boiler/availability", "online"),
+            ("busker/boiler/flow", "21.5"),
+            ("busker/boiler/old", "7"),
+            ("busker/pump/availability", "online"),
+        ] {
+            outbox.push(Message::retained(topic, payload));
+        }
+        outbox.connected();
+        while outbox.next_message().is_some() {}
+        outbox
+    }
+
+    fn sent(outbox: &mut Outbox) -> Vec<String> {
+        let next = || outbox.next_message().map(|message| format!("{} {}", message.topic, message.payload));
+        std::iter::from_fn(next).collect()
+    }
+
+    fn without_the_pump(outbox: &mut Outbox) {
+        let wanted = ["busker/boiler/availability", "busker/boiler/flow"].map(String::from);
+        outbox.reconfigure(["busker_bridge", "busker_boiler"].map(String::from), &wanted.into());
+    }
+
+    const TAKEN_BACK: [&str; 3] =
+        ["homeassistant/device/busker_pump/config ", "busker/pump/availability ", "busker/boiler/old "];
+
+    #[test]
+    fn what_is_gone_is_taken_back_and_the_rest_is_left_alone() {
+        let mut outbox = outbox();
+        without_the_pump(&mut outbox);
+        assert_eq!(sent(&mut outbox), TAKEN_BACK);
+        outbox.connected();
+        let again = sent(&mut outbox);
+        assert_eq!(again.len(), 6, "{again:?}");
+        assert!(!again.iter().any(|sent| sent.contains("pump") || sent.contains("old")), "{again:?}");
+    }
+
+    #[test]
+    fn what_is_gone_while_the_broker_is_away_is_taken_back_when_it_is_there() {
+        let mut outbox = outbox();
+        without_the_pump(&mut outbox);
+        // Meanwhile one of them is there again.
+        outbox.push(Message::retained("busker/boiler/old", "8"));
+        outbox.connected();
+        let sent = sent(&mut outbox);
+        assert_eq!(sent[sent.len() - 2..], TAKEN_BACK[..2]);
+        assert!(sent.contains(&"busker/boiler/old 8".to_string()), "{sent:?}");
+        assert!(!sent.contains(&TAKEN_BACK[2].to_string()), "{sent:?}");
+    }
+
+    #[test]
+    fn everything_can_be_taken_back() {
+        let mut outbox = outbox();
+        outbox.take_back_everything();
+        let sent = sent(&mut outbox);
+        assert_eq!(sent.len(), 8, "{sent:?}");
+        assert!(sent.iter().all(|sent| sent.ends_with(' ')), "{sent:?}");
+    }
+}

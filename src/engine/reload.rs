@@ -1,0 +1,189 @@
+//! From one configuration to another without a gap: what is left alone, what begins and what ends.
+
+use std::collections::BTreeSet;
+
+use crate::engine::settings::{Bus, DeviceSettings, Settings};
+use crate::engine::topics::Topics;
+
+/// What has to be done so that the gateway is as the new settings want it.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Change {
+    /// What all topics and announcements are made of has changed, or where things are remembered:
+    /// everything begins anew.
+    Everything,
+    Parts(Parts),
+}
+
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Parts {
+    /// The connection to the broker is made anew.
+    pub broker: bool,
+    pub http: bool,
+    /// In the order of the new settings.
+    pub buses: Vec<(String, Fate)>,
+    /// Buses that are there no more.
+    pub ended: Vec<String>,
+}
+
+/// What becomes of a bus.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Fate {
+    /// It goes on. These devices leave it, and then these come to it; a changed one does both.
+    Stays {
+        leave: Vec<String>,
+        come: Vec<DeviceSettings>,
+    },
+    /// Its link or what concerns all of its devices has changed.
+    Restarts,
+    Begins,
+}
+
+impl Parts {
+    pub fn is_nothing(&self) -> bool {
+        let stays = |(_, fate): &(String, Fate)| matches!(fate, Fate::Stays { leave, come } if leave.is_empty() && come.is_empty());
+        !self.broker && !self.http && self.ended.is_empty() && self.buses.iter().all(stays)
+    }
+}
+
+/// Compares two configurations.
+pub fn compare(old: &Settings, new: &Settings) -> Change {
+    let concerns_all = |settings: &Settings| {
+        let topics = (settings.mqtt.base_topic.clone(), settings.home_assistant.clone());
+        (topics, settings.state_dir.clone())
+    };
+    if concerns_all(old) != concerns_all(new) {
+        return Change::Everything;
+    }
+    let rules = |settings: &Settings| (settings.republish, settings.on_broker_loss, settings.eeprom);
+    let same_rules = rules(old) == rules(new);
+    let fate = |bus: &Bus| match old.buses.iter().find(|other| other.name == bus.name) {
+        None => Fate::Begins,
+        Some(before) if before != bus || !same_rules => Fate::Restarts,
+        Some(_) => {
+            let (before, after) = (devices_on(old, &bus.name), devices_on(new, &bus.name));
+            let leave = before.iter().filter(|device| !after.contains(device));
+            let come = after.iter().filter(|device| !before.contains(device));
+            Fate::Stays {
+                leave: leave.map(|device| device.name.clone()).collect(),
+                come: come.cloned().collect(),
+            }
+        }
+    };
+    let is_gone = |bus: &&Bus| !new.buses.iter().any(|other| other.name == bus.name);
+    Change::Parts(Parts {
+        broker: old.mqtt != new.mqtt,
+        http: old.http != new.http,
+        buses: new.buses.iter().map(|bus| (bus.name.clone(), fate(bus))).collect(),
+        ended: old.buses.iter().filter(is_gone).map(|bus| bus.name.clone()).collect(),
+    })
+}
+
+/// The devices on a bus, whatever number that has.
+fn devices_on(settings: &Settings, bus: &str) -> Vec<DeviceSettings> {
+    let of_bus = settings.devices.iter().filter(|device| settings.buses[device.bus].name == bus);
+    of_bus.map(|device| DeviceSettings { bus: 0, ..device.clone() }).collect()
+}
+
+/// The names of all devices that are not as they were: also those of buses that restart or end.
+pub fn changed_devices(old: &Settings, new: &Settings) -> BTreeSet<String> {
+    let with_bus = |settings: &Settings, name: &str| {
+        let device = settings.devices.iter().find(|device| device.name == name)?;
+        Some((settings.buses[device.bus].clone(), DeviceSettings { bus: 0, ..device.clone() }))
+    };
+    let names = old.devices.iter().chain(&new.devices).map(|device| device.name.clone());
+    names.filter(|name| with_bus(old, name) != with_bus(new, name)).collect()
+}
+
+/// Every retained topic that the devices of these settings tell something on.
+pub fn topics_of_devices(settings: &Settings) -> BTreeSet<String> {
+    let topics = Topics::new(&settings.mqtt.base_topic);
+    let of_device = |device: &DeviceSettings| {
+        let points = device.device.points.iter().map(|point| &point.name);
+        let things = device.device.things.iter().map(|thing| &thing.name);
+        let states: Vec<String> = points.chain(things).map(|name| topics.state(&device.name, name)).collect();
+        [topics.availability(&device.name), topics.info(&device.name)].into_iter().chain(states)
+    };
+    settings.devices.iter().flat_map(of_device).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::configuration;
+    use crate::engine::profile::Library;
+
+    const BEFORE: &str = "
+mqtt: {url: 'mqtt://localhost'}
+buses: {a: {tcp: 'host:502'}, b: {tcp: 'host:503'}}
+devices:
+  one: {bus: a, unit: 1, points: {x: {at: input 0, poll: fast}}}
+  two: {bus: a, unit: 2, points: {x: {at: input 0, poll: fast}}}
+  three: {bus: b, unit: 3, points: {x: {at: input 0, poll: fast}}}
+";
+
+    fn settings(text: &str) -> Settings {
+        let loaded = configuration::load("busker.yaml", text.as_bytes(), &Library::shipped());
+        loaded.unwrap_or_else(|faults| panic!("{faults:?}")).0
+    }
+
+    /// The change that follows from putting `to` where `from` stands, in a few words.
+    #[track_caller]
+    fn check(changes: &[(&str, &str)], expected: &str) {
+        let mut text = BEFORE.to_string();
+        for (from, to) in changes {
+            assert!(text.contains(from), "{from}");
+            text = text.replace(from, to);
+        }
+        let told = match compare(&settings(BEFORE), &settings(&text)) {
+            Change::Everything => "everything".into(),
+            Change::Parts(parts) => {
+                let mut words: Vec<String> = Vec::new();
+                words.extend(parts.broker.then(|| "broker".into()));
+                words.extend(parts.http.then(|| "http".into()));
+                for (name, fate) in &parts.buses {
+                    match fate {
+                        Fate::Restarts => words.push(format!("{name} restarts")),
+                        Fate::Begins => words.push(format!("{name} begins")),
+                        Fate::Stays { leave, come } => {
+                            words.extend(leave.iter().map(|device| format!("{device} leaves {name}")));
+                            words
+                                .extend(come.iter().map(|device| format!("{} comes to {name}", device.name)));
+                        }
+                    }
+                }
+                words.extend(parts.ended.iter().map(|name| format!("{name} ends")));
+                assert_eq!(parts.is_nothing(), words.is_empty());
+                words.join(", ")
+            }
+        };
+        assert_eq!(told, expected, "{changes:?}");
+    }
+
+    #[test]
+    fn only_what_changed_is_touched() {
+        check(&[("\nmqtt:", "\n# nothing but a comment\nmqtt:")], "");
+        check(&[("localhost", "other")], "broker");
+        check(&[("\nmqtt:", "\nhttp: {listen: null}\nmqtt:")], "http");
+        check(&[("two: {bus: a, unit: 2", "two: {bus: a, unit: 3")], "two leaves a, two comes to a");
+        check(
+            &[("two: {bus: a", "two: {bus: b"), ("three: {bus: b", "three: {bus: a")],
+            "two leaves a, three comes to a, three leaves b, two comes to b",
+        );
+        check(&[("three:", "four:")], "three leaves b, four comes to b");
+        check(&[("host:503", "host:504")], "b restarts");
+        check(&[("{a: ", "{c: {tcp: 'host:505'}, a: ")], "c begins");
+        check(&[("b: {tcp", "c: {tcp"), ("bus: b", "bus: c")], "c begins, b ends");
+        check(
+            &[(
+                "{a: {tcp: 'host:502'}, b: {tcp: 'host:503'}}",
+                "{b: {tcp: 'host:503'}, a: {tcp: 'host:502'}}",
+            )],
+            "",
+        );
+        check(&[("\nmqtt:", "\neeprom: {daily: 7}\nmqtt:")], "a restarts, b restarts");
+        check(&[("\nmqtt:", "\nrepublish: 5m\nmqtt:")], "a restarts, b restarts");
+        check(&[("'mqtt://localhost'", "'mqtt://localhost', base_topic: house")], "everything");
+        check(&[("\nmqtt:", "\nhome_assistant: {discovery: false}\nmqtt:")], "everything");
+        check(&[("\nmqtt:", "\nstate_dir: /tmp\nmqtt:")], "everything");
+    }
+}

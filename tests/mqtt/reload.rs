@@ -1,0 +1,338 @@
+//! A changed configuration while the gateway runs.
+
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::unix::net::UnixDatagram;
+use std::sync::{Arc, Mutex};
+use std::thread;
+
+use busker::edge::clock::Clock;
+use busker::engine::time::{Duration, Time};
+
+use crate::rig::{Broker, Gateway, Received, Watcher, eventually};
+use crate::{json, over_tcp, remembered, simulation};
+
+/// A server of Modbus TCP that answers every read with zeros and remembers when it was asked.
+struct Witness {
+    address: SocketAddr,
+    asked: Arc<Mutex<Vec<Time>>>,
+    connections: Arc<Mutex<u32>>,
+}
+
+impl Witness {
+    fn start() -> Witness {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = listener.local_addr().expect("its address");
+        let witness = Witness { address, asked: Arc::default(), connections: Arc::default() };
+        let (asked, connections, clock) =
+            (witness.asked.clone(), witness.connections.clone(), Clock::start());
+        thread::spawn(move || {
+            for stream in listener.incoming().map_while(Result::ok) {
+                *connections.lock().expect("nobody panics with it") += 1;
+                let asked = asked.clone();
+                thread::spawn(move || serve(stream, &asked, clock));
+            }
+        });
+        witness
+    }
+
+    fn count(&self) -> usize {
+        self.asked.lock().expect("nobody panics with it").len()
+    }
+
+    fn wait_for_more(&self, more: usize) {
+        let wanted = self.count() + more;
+        eventually(|| (self.count() >= wanted).then_some(())).expect("polls go on");
+    }
+
+    /// The longest time between two questions, from the question number `from` on.
+    fn longest_gap(&self, from: usize) -> Duration {
+        let asked = self.asked.lock().expect("nobody panics with it");
+        asked[from..].windows(2).map(|pair| pair[1] - pair[0]).max().expect("two questions")
+    }
+
+    fn connections(&self) -> u32 {
+        *self.connections.lock().expect("nobody panics with it")
+    }
+}
+
+fn serve(mut stream: TcpStream, asked: &Mutex<Vec<Time>>, clock: Clock) {
+    let mut request = [0; 12];
+    while stream.read_exact(&mut request).is_ok() {
+        asked.lock().expect("nobody panics with it").push(clock.now());
+        let count = request[11];
+        let mut reply = request[..4].to_vec();
+        reply.extend([0, 3 + 2 * count, request[6], request[7], 2 * count]);
+        reply.extend(vec![0; usize::from(2 * count)]);
+        if stream.write_all(&reply).is_err() {
+            return;
+        }
+    }
+}
+
+/// The unchanged bus and its only device.
+fn steady(witness: &Witness) -> (String, String) {
+    (
+        format!("steady: {{tcp: '{}'}}", witness.address),
+        "pump: {bus: steady, unit: 1, points: {flow: {at: input 0, poll: fast}}, poll: {fast: 300ms}}".into(),
+    )
+}
+
+fn text(broker: &Broker, buses: &[&str], devices: &[&str]) -> String {
+    format!(
+        "mqtt: {{url: 'mqtt://127.0.0.1:{}'}}\nbuses:\n  {}\ndevices:\n  {}\n",
+        broker.port,
+        buses.join("\n  "),
+        devices.join("\n  "),
+    )
+}
+
+const RELAYS: &str = "relays: {profile: metz-connect/mr-do4, bus: line, unit: 18, name: Relays}";
+const COUNTERS: &str = "counters: {profile: metz-connect/mr-si4, bus: line, unit: 20, name: Counters}";
+const DONE: &str = "what has changed is at work";
+
+#[track_caller]
+fn online(watcher: &Watcher, devices: &[&str]) {
+    for device in devices {
+        watcher.wait_for(&format!("busker/{device}/availability"), "online");
+    }
+}
+
+fn topics_of<'m>(all: &'m [Received], device: &str) -> Vec<&'m str> {
+    let (below, identity) = (format!("busker/{device}/"), format!("/busker_{device}/config"));
+    let of_it = |topic: &&str| topic.starts_with(&below) || topic.ends_with(&identity);
+    all.iter().map(|got| got.topic.as_str()).filter(of_it).collect()
+}
+
+#[test]
+fn what_is_unchanged_goes_on_while_the_rest_comes_goes_and_changes() {
+    let (broker, simulation, witness) = (Broker::start(), simulation(), Witness::start());
+    let port = over_tcp(&simulation);
+    let line = format!("line: {{tcp: '{}'}}", port.address());
+    let (steady, pump) = steady(&witness);
+    let watcher = Watcher::start(&broker, "watcher");
+    let first = text(&broker, &[&line, &steady], &[RELAYS, COUNTERS, &pump]);
+    let gateway = Gateway::start_with(&first);
+    online(&watcher, &["relays", "counters", "pump"]);
+    watcher.wait_until("discovery", |got| got.topic == "homeassistant/device/busker_counters/config");
+    witness.wait_for_more(3);
+
+    // A device goes, one is called otherwise, a bus with a device comes.
+    let (from, other) = (witness.count(), Witness::start());
+    let new_bus = format!("other: {{tcp: '{}'}}", other.address);
+    let valve = "valve: {bus: other, unit: 5, points: {position: {at: input 3, poll: fast}}}";
+    let relays = RELAYS.replace("Relays", "Heating");
+    gateway.write(&text(&broker, &[&steady, &new_bus, &line], &[&pump, valve, &relays]));
+    watcher.forget();
+    gateway.reload(DONE);
+    online(&watcher, &["valve", "relays"]);
+    watcher.wait_until("the new name", |got| {
+        got.topic.ends_with("busker_relays/config") && got.payload.contains("Heating")
+    });
+    watcher.wait_for("homeassistant/device/busker_counters/config", "");
+    watcher.wait_for("busker/counters/availability", "");
+    watcher.wait_until("the new info", |got| {
+        got.topic == "busker/bridge/info" && json(&got.payload)["devices"]["valve"]["bus"] == "other"
+    });
+    let told = watcher.received();
+    let of_pump = topics_of(&told, "pump");
+    assert!(of_pump.is_empty(), "the pump is told of although it is unchanged: {of_pump:?}");
+    let all = remembered(&broker, "newcomer");
+    assert!(topics_of(&all, "counters").is_empty(), "{:?}", topics_of(&all, "counters"));
+    assert!(topics_of(&all, "pump").len() >= 4, "{:?}", topics_of(&all, "pump"));
+    // Commands find their way although the buses have other numbers.
+    watcher.publish("busker/relays/relay_2/set", "ON");
+    let outcome = watcher.wait_until("an outcome", |got| got.topic == "busker/relays/relay_2/outcome");
+    assert_eq!(json(&outcome.payload)["outcome"], "done");
+
+    // A bus goes, with its device; another one gets another link.
+    gateway.write(&text(
+        &broker,
+        &[&steady, &line.replace("'}", "', response_timeout: 700ms}")],
+        &[&pump, &relays],
+    ));
+    watcher.forget();
+    gateway.reload(DONE);
+    watcher.wait_for("homeassistant/device/busker_bus_other/config", "");
+    watcher.wait_for("busker/valve/position", "");
+    online(&watcher, &["relays"]);
+    let (code, health) = gateway.get("/health");
+    let health = json(&health);
+    assert_eq!((code, &health["status"]), (200, &"ok".into()), "{health}");
+    assert!(health["buses"]["other"].is_null() && health["devices"]["valve"].is_null(), "{health}");
+
+    witness.wait_for_more(3);
+    assert_eq!(witness.connections(), 1, "the unchanged bus kept its connection");
+    // Each period is 300 ms: where a poll is left out, twice that passes.
+    let longest = witness.longest_gap(from.saturating_sub(2));
+    assert!(longest < Duration::from_millis(600), "a poll was lost: {longest:?}");
+    assert!(gateway.terminate().success());
+}
+
+#[test]
+fn a_faulty_configuration_changes_nothing_and_is_shown_where_people_look() {
+    let (broker, witness) = (Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let watcher = Watcher::start(&broker, "watcher");
+    let good = text(&broker, &[&steady], &[&pump]);
+    let gateway = Gateway::start_with(&good);
+    online(&watcher, &["pump"]);
+
+    gateway.write(&text(&broker, &[&steady.replace("tcp", "tpc")], &[&pump.replace("unit: 1", "unit: 300")]));
+    watcher.forget();
+    gateway.reload("the new configuration is refused, and the old one goes on");
+    watcher.wait_until("the fault in bridge/info", |got| {
+        let error = |got: &Received| json(&got.payload)["configuration"]["error"].to_string();
+        got.topic == "busker/bridge/info" && error(got).contains("did you mean `tcp`?")
+    });
+    let (code, health) = gateway.get("/health");
+    let error = json(&health)["configuration"]["error"].to_string();
+    assert!(code == 200 && error.contains("300"), "{health}");
+    witness.wait_for_more(3);
+    assert_eq!(watcher.payloads("busker/pump/availability"), [""; 0]);
+
+    // What cannot be had is found before anything changes.
+    let taken = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = taken.local_addr().expect("its address");
+    let http = format!("http: {{listen: '{address}'}}");
+    let folder = tempfile::tempdir().expect("a folder");
+    let whole = format!("{http}\nstate_dir: {}\n{}", folder.path().display(), good.replace("flow", "rate"));
+    gateway.write_whole(&whole);
+    gateway.reload("HTTP cannot listen on");
+    watcher.wait_until("that fault in bridge/info", |got| {
+        got.topic == "busker/bridge/info" && got.payload.contains("HTTP cannot listen on")
+    });
+
+    watcher.forget();
+    gateway.write(&good);
+    gateway.reload("the new configuration changes nothing that runs");
+    watcher.wait_until("that all is good again", |got| {
+        got.topic == "busker/bridge/info" && json(&got.payload)["configuration"]["error"].is_null()
+    });
+    witness.wait_for_more(2);
+    assert_eq!(witness.connections(), 1);
+}
+
+#[test]
+fn another_broker_or_another_base_topic_is_taken_without_a_restart() {
+    let (old, new, witness) = (Broker::start(), Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let (of_old, of_new) = (Watcher::start(&old, "watcher"), Watcher::start(&new, "watcher"));
+    let gateway = Gateway::start_with(&text(&old, &[&steady], &[&pump]));
+    online(&of_old, &["pump"]);
+    let from = witness.count();
+
+    gateway.write(&text(&new, &[&steady], &[&pump]));
+    gateway.reload(DONE);
+    of_old.wait_for("busker/bridge/state", "offline");
+    of_new.wait_for("busker/bridge/state", "online");
+    of_new.wait_for("busker/pump/flow", "0");
+    witness.wait_for_more(2);
+    assert_eq!(witness.connections(), 1);
+    let longest = witness.longest_gap(from);
+    assert!(longest < Duration::from_millis(600), "a poll was lost: {longest:?}");
+
+    let text = text(&new, &[&steady], &[&pump]).replace("mqtt: {", "mqtt: {base_topic: house, ");
+    gateway.write(&text);
+    gateway.reload(DONE);
+    of_new.wait_for("busker/bridge/state", "offline");
+    of_new.wait_for("house/bridge/state", "online");
+    of_new.wait_for("house/pump/availability", "online");
+    let all = remembered(&new, "newcomer");
+    let left: Vec<&str> =
+        all.iter().map(|got| got.topic.as_str()).filter(|topic| topic.starts_with("busker/")).collect();
+    assert_eq!(left, ["busker/bridge/state"]);
+    assert!(topics_of(&all, "pump").is_empty());
+    assert_eq!(gateway.get("/health").0, 200);
+    assert!(gateway.terminate().success());
+}
+
+#[test]
+fn systemd_is_told_when_the_configuration_is_being_read_and_when_that_is_over() {
+    let (broker, witness) = (Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("notify");
+    let systemd = UnixDatagram::bind(&path).expect("a socket");
+    systemd.set_read_timeout(Some(Duration::from_secs(20))).expect("a timeout");
+    let hear = |wanted: &str| {
+        let mut buffer = [0; 4096];
+        loop {
+            let count = systemd.recv(&mut buffer).unwrap_or_else(|error| panic!("{wanted}: {error}"));
+            let told = String::from_utf8_lossy(&buffer[..count]).into_owned();
+            if told.contains(wanted) {
+                return told;
+            }
+        }
+    };
+    let environment = [("NOTIFY_SOCKET", path.to_str().expect("plain letters"))];
+    let gateway = Gateway::start_in(&environment, &text(&broker, &[&steady], &[&pump]));
+    hear("READY=1");
+    for (text, status) in [("nonsense", "STATUS=the new configuration is refused"), ("", "STATUS=")] {
+        match text {
+            "" => gateway.write(&self::text(&broker, &[&steady], &[&pump])),
+            nonsense => gateway.write(nonsense),
+        }
+        gateway.reload("SIGHUP");
+        assert!(hear("RELOADING=1").contains("MONOTONIC_USEC="));
+        hear(status);
+        hear("READY=1");
+    }
+}
+
+#[test]
+fn what_a_changed_device_has_no_more_is_taken_back_at_the_broker() {
+    let (broker, witness) = (Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start_with(&text(&broker, &[&steady], &[&pump]));
+    watcher.wait_for("busker/pump/flow", "0");
+    let config = "homeassistant/device/busker_pump/config";
+    watcher.wait_until("discovery", |got| got.topic == config);
+
+    watcher.forget();
+    gateway.write(&text(&broker, &[&steady], &[&pump.replace("flow", "rate")]));
+    gateway.reload(DONE);
+    watcher.wait_for("busker/pump/flow", "");
+    watcher.wait_for("busker/pump/rate", "0");
+    // Home Assistant is told that the one is gone before it is told of the other alone.
+    let components = |got: &Received| json(&got.payload)["components"].clone();
+    watcher.wait_until("the farewell", |got| {
+        got.topic == config && components(got)["flow"].as_object().is_some_and(|flow| flow.len() == 1)
+    });
+    let all = remembered(&broker, "newcomer");
+    let left = all.iter().find(|got| got.topic == config).expect("the pump is announced");
+    assert!(components(left)["flow"].is_null() && components(left)["rate"].is_object(), "{}", left.payload);
+    assert!(!topics_of(&all, "pump").contains(&"busker/pump/flow"));
+}
+
+#[test]
+fn http_moves_to_another_address() {
+    let (broker, witness) = (Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let text = text(&broker, &[&steady], &[&pump]);
+    let gateway = Gateway::start_with(&text);
+    let state = tempfile::tempdir().expect("a folder");
+    let at = |http: &str| format!("http: {{listen: {http}}}\nstate_dir: {}\n{text}", state.path().display());
+    gateway.write_whole(&at("'localhost:0'"));
+    gateway.reload("HTTP on http://");
+    let lines = gateway.log();
+    let moved = lines.iter().rev().find_map(|line| line.split("HTTP on ").nth(1)).expect("its address");
+    let status = |url: &str| ureq::get(url).call().map(|answer| answer.status().as_u16()).ok();
+    eventually(|| (status(moved) == Some(200)).then_some(())).expect("HTTP answers at its new address");
+    eventually(|| status(&format!("{}/health", gateway.http())).is_none().then_some(()))
+        .expect("and not at the old one");
+    // The same port by another name, and with a token.
+    let port = moved.split('/').nth(2).and_then(|host| host.rsplit(':').next()).expect("its port");
+    let token = "x".repeat(32);
+    gateway.write_whole(&at(&format!("'localhost:{port}', token: {token}")));
+    gateway.reload(DONE);
+    let devices = moved.replace("/health", "/api/devices");
+    assert_eq!(status(moved), Some(200));
+    assert_eq!(status(&devices), None, "without the token nobody is let in");
+    let with_token = ureq::get(&devices).header("Authorization", format!("Bearer {token}")).call();
+    assert_eq!(with_token.expect("the token is known").status().as_u16(), 200);
+    gateway.write_whole(&at("null"));
+    gateway.reload(DONE);
+    eventually(|| status(moved).is_none().then_some(())).expect("HTTP is off");
+}
