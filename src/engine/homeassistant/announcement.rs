@@ -196,11 +196,12 @@ fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Ent
     component.insert("name".into(), name_beside(&entity.name, &device.title));
     let platform = entity.platform;
     component.insert("unique_id".into(), format!("{}_{}", topics.identity(&device.name), entity.key).into());
-    // The point's name without the case. When an input is set to a sensor of another unit, a second
-    // entity comes, with a history of its own, and Home Assistant ends its entity id in `_2`.
-    let object = if platform == Platform::Button { &entity.key } else { point };
-    component
-        .insert("default_entity_id".into(), format!("{}.{}_{object}", platform.name(), device.name).into());
+    // With the case's unit: Home Assistant still has the entity of the case before when the new one
+    // comes, and would end the id of the same name in `_2`.
+    component.insert(
+        "default_entity_id".into(),
+        format!("{}.{}_{}", platform.name(), device.name, entity.key).into(),
+    );
     if platform != Platform::Button {
         component.insert("state_topic".into(), topics.state(&device.name, point).into());
     }
@@ -316,7 +317,7 @@ mod tests {
                     "state_class": "measurement",
                     "suggested_display_precision": 0,
                     "unique_id": "busker_heating_input_c",
-                    "default_entity_id": "sensor.heating_input",
+                    "default_entity_id": "sensor.heating_input_c",
                     "state_topic": "busker/heating/input",
                 },
             },

@@ -42,6 +42,8 @@ pub struct Entity {
     pub press: Option<String>,
     /// Turns what is no number in the entity's sense into `None`, where that can come.
     pub value_template: Option<String>,
+    /// Turns what Home Assistant calls otherwise into what the gateway calls it.
+    pub command_template: Option<String>,
 }
 
 impl Entity {
@@ -97,6 +99,7 @@ impl Entity {
         put("max", self.length.map(|length| length.min(255).into()));
         put("payload_press", self.press.clone().map(Value::from));
         put("value_template", self.value_template.clone().map(Value::from));
+        put("command_template", self.command_template.clone().map(Value::from));
         component
     }
 }
@@ -134,6 +137,7 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
         length: None,
         press: (platform == Platform::Button).then(|| "PRESS".into()),
         value_template: None,
+        command_template: None,
     };
     if entity.is_number(&resolved) {
         describe_number(&mut entity, point, &resolved);
@@ -145,7 +149,11 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
                 entity.options.push(name.clone());
             }
         }
-        entity.device_class = (platform == Platform::Sensor).then(|| "enum".into());
+        if platform == Platform::Sensor {
+            entity.device_class = Some("enum".into());
+        } else {
+            avoid_none(&mut entity);
+        }
     } else {
         entity.device_class = fitting_class(point, platform, None);
         entity.event_types = point.event.iter().cloned().collect();
@@ -158,6 +166,22 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
         }
     }
     Some(entity)
+}
+
+/// A select takes `none`, however it is written, for an unknown state: an option of that name gets
+/// another one in Home Assistant.
+fn avoid_none(entity: &mut Entity) {
+    let Some(at) = entity.options.iter().position(|option| option.eq_ignore_ascii_case("none")) else {
+        return;
+    };
+    let mut shown = "nothing".to_string();
+    while entity.options.contains(&shown) {
+        shown.push('_');
+    }
+    let name = std::mem::replace(&mut entity.options[at], shown.clone());
+    let template = |from: &str, to: &str| format!("{{{{ '{to}' if value == '{from}' else value }}}}");
+    entity.value_template = Some(template(&name, &shown));
+    entity.command_template = Some(template(&shown, &name));
 }
 
 /// Whether enough is known to say which entities there are: no point waits for another one.
@@ -213,6 +237,7 @@ fn button_beside(device: &Device, point: &Point, main: &Entity, name: &str) -> E
         length: None,
         press: Some(name.to_string()),
         value_template: None,
+        command_template: None,
     }
 }
 
@@ -454,6 +479,13 @@ mod tests {
                 },
             ),
             &["select flow_value: entity_category=config options=[\"off\",\"pt100\"]"],
+        );
+        let with_none = Names::All(named(&[(0, "none"), (2, "temperature")]));
+        check_entity(
+            point_with(Form { names: with_none, ..Form::new(Kind::U16) }, Some(WriteRule::Any), NOTHING),
+            &["select flow_value: options=[\"nothing\",\"temperature\"] \
+               value_template={{ 'nothing' if value == 'none' else value }} \
+               command_template={{ 'none' if value == 'nothing' else value }}"],
         );
         check_entity(
             point_with(
