@@ -584,7 +584,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             self.subscribed = self.client.try_subscribe_many(self.filters.iter().map(filter)).is_ok();
         }
         let mut outbox = self.mailbox.outbox();
-        while let Some(message) = outbox.next_message() {
+        while let Some(message) = outbox.next_message(self.clock.now()) {
             let payload = message.payload.as_bytes();
             let taken = self.client.try_publish(&message.topic, QoS::AtLeastOnce, message.retain, payload);
             if taken.is_err() {
@@ -592,7 +592,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 return false;
             }
         }
-        self.subscribed
+        self.subscribed && outbox.is_empty()
     }
 
     /// Waits until the library has sent everything and the connection is closed.

@@ -17,6 +17,12 @@ const ONCE_MAX: usize = 256;
 /// and takes no notice of what comes before (0.4 s were too short, 0.8 s long enough).
 const STATES_AFTER_DISCOVERY: Duration = Duration::from_millis(1500);
 
+/// So many messages are told in so long, at the most: a mosquitto queues a thousand for each reader and
+/// drops what is beyond, and a Home Assistant takes some hundred a second. When a gateway with many
+/// points came back, what was dropped could be that it is online.
+const AT_ONCE: usize = 100;
+const PERIOD: Duration = Duration::from_millis(200);
+
 /// The messages of one gateway on their way to its broker.
 #[derive(Clone, Debug)]
 pub struct Outbox {
@@ -37,6 +43,9 @@ pub struct Outbox {
     /// Counts the retained topics, to send them again in the order in which they first came.
     next_number: u64,
     states_due_at: Option<Time>,
+    /// When the present period began, and how many messages were told in it.
+    period_began: Time,
+    told: usize,
 }
 
 #[derive(Clone, Debug)]
@@ -76,6 +85,8 @@ impl Outbox {
             dropped: 0,
             next_number: 0,
             states_due_at: None,
+            period_began: Time(0),
+            told: 0,
         }
     }
 
@@ -88,8 +99,26 @@ impl Outbox {
         }
     }
 
-    /// The next message to send, if one waits.
-    pub fn next_message(&mut self) -> Option<Message> {
+    /// The next message to send, if one waits and not too many have been told in a short time
+    /// ([`Outbox::wake_at`]).
+    pub fn next_message(&mut self, now: Time) -> Option<Message> {
+        if now >= self.period_began + PERIOD {
+            (self.period_began, self.told) = (now, 0);
+        }
+        if self.told == AT_ONCE {
+            return None;
+        }
+        let message = self.take_first()?;
+        self.told += 1;
+        Some(message)
+    }
+
+    /// Whether nothing waits.
+    pub fn is_empty(&self) -> bool {
+        self.queue.is_empty()
+    }
+
+    fn take_first(&mut self) -> Option<Message> {
         loop {
             match self.queue.pop_front()? {
                 Queued::Once(message) => {
@@ -109,6 +138,7 @@ impl Outbox {
 
     /// A message from [`Outbox::next_message`] could not be handed over: it is next again.
     pub fn put_back(&mut self, message: Message) {
+        self.told = self.told.saturating_sub(1);
         if !message.retain {
             self.once_waiting += 1;
             self.queue.push_front(Queued::Once(message));
@@ -215,9 +245,10 @@ impl Outbox {
         self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
     }
 
-    /// When [`Outbox::wake`] has something to do.
+    /// When [`Outbox::wake`] or [`Outbox::next_message`] has something to do.
     pub fn wake_at(&self) -> Option<Time> {
-        self.states_due_at
+        let held_back = (self.told == AT_ONCE && !self.is_empty()).then(|| self.period_began + PERIOD);
+        self.states_due_at.into_iter().chain(held_back).min()
     }
 
     /// The time of [`Outbox::wake_at`] has come.
@@ -347,11 +378,24 @@ mod tests {
         outbox.push(Message::once(topic, payload));
     }
 
+    /// Long after whatever was told before.
+    const LATER: Time = Time::from_millis(1_000_000_000);
+
+    fn take_all(outbox: &mut Outbox) -> Vec<Message> {
+        let mut now = LATER;
+        let mut all = Vec::new();
+        while !outbox.is_empty() {
+            all.extend(std::iter::from_fn(|| outbox.next_message(now)));
+            now += PERIOD;
+        }
+        all
+    }
+
     /// Takes all and compares: `topic payload`, with a `!` behind what is not retained.
     #[track_caller]
     fn check_sent(outbox: &mut Outbox, expected: &[&str]) {
         let mut sent = Vec::new();
-        while let Some(message) = outbox.next_message() {
+        for message in take_all(outbox) {
             let mark = if message.retain { "" } else { "!" };
             sent.push(format!("{} {}{mark}", message.topic, message.payload));
         }
@@ -366,7 +410,7 @@ mod tests {
         retained(&mut outbox, "homeassistant/device/busker_bridge/config", "{1}");
         retained(&mut outbox, "homeassistant/device/busker_boiler/config", "{2}");
         retained(&mut outbox, "busker/bridge/info", "{3}");
-        while outbox.next_message().is_some() {}
+        take_all(&mut outbox);
         outbox
     }
 
@@ -410,7 +454,7 @@ mod tests {
     fn a_start_of_home_assistant_is_answered_with_discovery_and_later_with_values() {
         let mut outbox = filled();
         outbox.connected();
-        while outbox.next_message().is_some() {}
+        take_all(&mut outbox);
         let now = Time::from_millis(10_000);
         outbox.home_assistant_started(now);
         check_sent(&mut outbox, &EVERYTHING[1..3]);
@@ -425,11 +469,35 @@ mod tests {
     }
 
     #[test]
+    fn no_more_is_told_at_once_than_a_broker_queues_and_online_comes_last() {
+        let mut outbox = filled();
+        for number in 0..2 * AT_ONCE {
+            retained(&mut outbox, &format!("busker/boiler/value_{number:03}"), "1");
+        }
+        outbox.connected();
+        let mut told = Vec::new();
+        let first = LATER + PERIOD;
+        let mut times = vec![first];
+        loop {
+            let now = times[times.len() - 1];
+            let sent: Vec<Message> = std::iter::from_fn(|| outbox.next_message(now)).collect();
+            assert!(sent.len() <= AT_ONCE, "{} at once", sent.len());
+            told.extend(sent.into_iter().map(|message| message.topic));
+            let Some(due) = outbox.wake_at() else { break };
+            times.push(due);
+        }
+        assert_eq!(times, [first, first + PERIOD, first + PERIOD + PERIOD]);
+        assert_eq!(told.last().map(String::as_str), Some("busker/bridge/state"));
+        assert_eq!(told.len(), outbox.retained.len());
+        assert!(outbox.is_empty());
+    }
+
+    #[test]
     fn what_could_not_be_handed_over_is_next_again_unless_it_is_old() {
         let mut outbox = outbox();
         retained(&mut outbox, "busker/a/x", "1");
         once(&mut outbox, "busker/a/x/outcome", "done");
-        let first = outbox.next_message().expect("two wait");
+        let first = outbox.next_message(LATER).expect("two wait");
         outbox.put_back(first.clone());
         check_sent(&mut outbox, &["busker/a/x 1", "busker/a/x/outcome done!"]);
         retained(&mut outbox, "busker/a/x", "2");
@@ -445,9 +513,9 @@ mod tests {
             once(&mut outbox, "busker/a/x/outcome", &number.to_string());
         }
         assert_eq!(outbox.dropped(), 3);
-        assert_eq!(outbox.next_message(), Some(Message::retained("busker/a/x", "1")));
-        assert_eq!(outbox.next_message(), Some(Message::once("busker/a/x/outcome", "3")));
-        assert_eq!(std::iter::from_fn(|| outbox.next_message()).count(), ONCE_MAX - 1);
+        assert_eq!(outbox.next_message(LATER), Some(Message::retained("busker/a/x", "1")));
+        assert_eq!(outbox.next_message(LATER), Some(Message::once("busker/a/x/outcome", "3")));
+        assert_eq!(take_all(&mut outbox).len(), ONCE_MAX - 1);
     }
 
     /// What this gateway announces of a device with these components.
@@ -479,7 +547,7 @@ mod tests {
         check_sent(&mut early, &expected);
         let mut late = outbox();
         retained(&mut late, config, &new);
-        assert!(late.next_message().is_some());
+        assert!(late.next_message(LATER).is_some());
         late.found(config, &old);
         check_sent(&mut late, &expected);
         late.found(config, &new);
@@ -490,7 +558,7 @@ mod tests {
         outbox.found("homeassistant/device/busker_gone/config", &old);
         outbox.found("homeassistant/device/busker_2_gone/config", &old.replace("busker/", "busker_2/"));
         outbox.found("homeassistant/device/stranger/config", "{}");
-        let removal = outbox.next_message().expect("the device is removed");
+        let removal = outbox.next_message(LATER).expect("the device is removed");
         outbox.put_back(removal);
         check_sent(&mut outbox, &["homeassistant/device/busker_gone/config "]);
     }
@@ -504,7 +572,7 @@ mod tests {
         retained(&mut outbox, config, &new);
         outbox.found(config, &old);
         outbox.found(gone, &old);
-        while outbox.next_message().is_some() {}
+        take_all(&mut outbox);
         outbox.home_assistant_started(Time::from_millis(0));
         let farewell = announcement(&["level", "flow"]);
         let expected = [
@@ -538,7 +606,7 @@ mod tests {
         let expected = [format!("{config} {{farewell}}!"), format!("{config} {{new}}")];
         check_sent(&mut outbox.clone(), &[&expected[0], &expected[1]]);
         outbox.connected();
-        let sent: Vec<Message> = std::iter::from_fn(|| outbox.next_message()).collect();
+        let sent: Vec<Message> = take_all(&mut outbox);
         let at = sent.iter().position(|message| !message.retain).expect("the farewell is sent");
         assert_eq!((sent[at].topic.as_str(), sent[at + 1].topic.as_str()), (config, config));
     }

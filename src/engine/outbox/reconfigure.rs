@@ -64,6 +64,7 @@ impl Outbox {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::time::Time;
     use crate::engine::topics::{Message, Topics};
 
     fn outbox() -> Outbox {
@@ -82,12 +83,13 @@ mod tests {
             outbox.push(Message::retained(topic, payload));
         }
         outbox.connected();
-        while outbox.next_message().is_some() {}
+        while outbox.next_message(Time(0)).is_some() {}
         outbox
     }
 
     fn sent(outbox: &mut Outbox) -> Vec<String> {
-        let next = || outbox.next_message().map(|message| format!("{} {}", message.topic, message.payload));
+        let next =
+            || outbox.next_message(Time(0)).map(|message| format!("{} {}", message.topic, message.payload));
         std::iter::from_fn(next).collect()
     }
 
