@@ -10,8 +10,13 @@ standard input is a command with a `do`; each gets one line of answer on standar
     {"do": "devices"}                     every MQTT device
     {"do": "wait", "for": {ID: {…}, …}, "seconds": 20}
                                           until the entities with these unique ids look like this: any of
-                                          what `entities` tells, and `exists` (false: not there at all)
+                                          what `entities` tells, and `exists` (false: not there at all) and
+                                          `not_state`; numbers are compared as numbers
     {"do": "call", "service": "switch.turn_on", "entity": ID, "data": {…}}
+    {"do": "enable"}                      as a user enables every entity that is disabled; says how many. What
+                                          comes after that comes enabled, so that nothing has to be set up anew
+    {"do": "personalize", "entity": ID, "name": NAME, "entity_id": ENTITY_ID}
+                                          as a user gives an entity his own name and id
     {"do": "log"}                         what was logged as a warning or worse, and open repair issues
     {"do": "quit"}
 """
@@ -19,11 +24,13 @@ standard input is a command with a `do`; each gets one line of answer on standar
 import asyncio
 import json
 import logging
+import math
 import os
 import pathlib
 import sys
 
-from homeassistant import bootstrap, core, loader, runner
+from homeassistant import bootstrap, config_entries, core, loader, runner
+from homeassistant.components.mqtt import client as mqtt_client, entity as mqtt_entity
 from homeassistant.const import EVENT_STATE_CHANGED, __version__
 from homeassistant.helpers import device_registry, entity_registry, issue_registry
 
@@ -31,6 +38,11 @@ CORE = {
     "name": "busker's test", "latitude": 48, "longitude": 8, "elevation": 0, "unit_system": "metric",
     "time_zone": "UTC", "currency": "EUR", "country": "DE",
 }
+
+
+# A user waits so long; the test does not.
+config_entries.RELOAD_AFTER_UPDATE_DELAY = 0.5
+mqtt_client.RECONNECT_INTERVAL_SECONDS = 1
 
 
 class Warnings(logging.Handler):
@@ -58,7 +70,14 @@ class Probe:
 
     def registered(self) -> dict:
         entries = entity_registry.async_get(self.hass).entities.values()
-        return {entry.unique_id: entry for entry in entries if entry.platform == "mqtt"}
+        found = {}
+        for entry in entries:
+            if entry.platform != "mqtt":
+                continue
+            if entry.unique_id in found:
+                raise ValueError(f"{entry.entity_id} and {found[entry.unique_id].entity_id} share {entry.unique_id}")
+            found[entry.unique_id] = entry
+        return found
 
     def entity(self, entry) -> dict:
         state = self.hass.states.get(entry.entity_id)
@@ -67,7 +86,7 @@ class Probe:
         return {
             "entity_id": entry.entity_id,
             "platform": entry.domain,
-            "name": entry.original_name,
+            "name": entry.name or entry.original_name,
             "device": next(iter(device.identifiers))[1] if device else None,
             "device_class": entry.original_device_class,
             "state_class": attributes.get("state_class"),
@@ -77,7 +96,14 @@ class Probe:
             "options": attributes.get("options"),
             "min": attributes.get("min"),
             "max": attributes.get("max"),
+            "event_type": attributes.get("event_type"),
+            "temperature": attributes.get("temperature"),
+            "current_temperature": attributes.get("current_temperature"),
+            "hvac_modes": attributes.get("hvac_modes"),
+            "min_temp": attributes.get("min_temp"),
+            "max_temp": attributes.get("max_temp"),
             "state": state.state if state else None,
+            "number": number(state.state) if state else None,
             "known": state is not None and state.state not in ("unavailable", "unknown"),
         }
 
@@ -105,11 +131,11 @@ class Probe:
         for unique_id, facts in wanted.items():
             entry = registered.get(unique_id)
             seen = self.entity(entry) if entry else {}
-            wants = {key: value for key, value in facts.items() if key != "exists"}
-            if facts.get("exists", True) != (entry is not None) or any(
-                seen.get(key) != value for key, value in wants.items()
-            ):
-                missing[unique_id] = {key: seen.get(key) for key in facts} if entry else "no such entity"
+            wants = {key: value for key, value in facts.items() if key not in ("exists", "not_state")}
+            if facts.get("exists", True) != (entry is not None) or not all(
+                same(seen.get(key), value) for key, value in wants.items()
+            ) or ("not_state" in facts and seen.get("state") == facts["not_state"]):
+                missing[unique_id] = {key: seen.get(key) for key in ["state", *facts]} if entry else "no such entity"
         return missing
 
     async def wait(self, command: dict) -> None:
@@ -120,12 +146,30 @@ class Probe:
             try:
                 await asyncio.wait_for(self.changed.wait(), left)
             except TimeoutError:
-                raise TimeoutError(f"after {command['seconds']} s: {missing}") from None
+                shown = {unique_id: [seen, "instead of", command["for"][unique_id]]
+                         for unique_id, seen in list(missing.items())[:12]}
+                raise TimeoutError(
+                    f"after {command['seconds']} s {len(missing)} entities are not as they should be: {shown}"
+                ) from None
 
     async def call(self, command: dict) -> None:
         domain, service = command["service"].split(".")
         target = {"entity_id": self.registered()[command["entity"]].entity_id}
         await self.hass.services.async_call(domain, service, {**target, **command.get("data", {})}, blocking=True)
+
+    async def enable(self, _: dict) -> int:
+        mqtt_entity.MqttEntity.entity_registry_enabled_default = True
+        registry = entity_registry.async_get(self.hass)
+        disabled = [entry.entity_id for entry in self.registered().values() if entry.disabled_by]
+        for entity_id in disabled:
+            registry.async_update_entity(entity_id, disabled_by=None)
+        return len(disabled)
+
+    async def personalize(self, command: dict) -> None:
+        entry = self.registered()[command["entity"]]
+        entity_registry.async_get(self.hass).async_update_entity(
+            entry.entity_id, name=command["name"], new_entity_id=command["entity_id"]
+        )
 
     async def log(self, _: dict) -> list[str]:
         issues = issue_registry.async_get(self.hass).issues.values()
@@ -140,6 +184,19 @@ class Probe:
                 tell({"is": await getattr(self, command["do"])(command)})
             except Exception as fault:  # noqa: BLE001: whatever it is, the test is to say it
                 tell({"failed": f"{type(fault).__name__}: {fault}"})
+
+
+def number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def same(seen, wanted) -> bool:
+    if isinstance(seen, (int, float)) and isinstance(wanted, (int, float)):
+        return math.isclose(seen, wanted, rel_tol=1e-6, abs_tol=1e-9)
+    return seen == wanted
 
 
 answers = os.fdopen(os.dup(1), "w", buffering=1)
@@ -185,7 +242,7 @@ async def main(folder: pathlib.Path, broker_port: int) -> None:
     await hass.async_start()
     tell({"is": {"home_assistant": __version__, "python": sys.version.split()[0]}})
 
-    commands = asyncio.StreamReader(limit=1 << 20)
+    commands = asyncio.StreamReader(limit=1 << 24)
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
     await probe.serve(commands)
     await hass.async_stop()
