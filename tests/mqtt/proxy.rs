@@ -208,6 +208,7 @@ fn pump(shared: &Shared, mut from: &TcpStream, mut to: &TcpStream, to_broker: bo
             Err(error)
                 if matches!(error.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) =>
             {
+                // Only when nothing more has come: what was read first may have been something else.
                 if way == Way::LastWords && !to_broker {
                     return;
                 }
@@ -229,9 +230,6 @@ fn pump(shared: &Shared, mut from: &TcpStream, mut to: &TcpStream, to_broker: bo
         passed += allowed;
         if to_broker {
             lock(shared).told.extend(&bytes[..allowed]);
-        }
-        if way == Way::LastWords && !to_broker {
-            return;
         }
     }
 }
