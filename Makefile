@@ -3,7 +3,7 @@
 # Appended to PATH, so that nobody's own programs are hidden.
 WITH_MOSQUITTO = tools=$$(scripts/get-mosquitto) && PATH="$$PATH:$$tools"
 
-.PHONY: demo test test-page test-home-assistant lint goldens
+.PHONY: demo test test-page test-home-assistant lint goldens bench
 
 # The whole program without hardware: simulated devices, a broker, the gateway. Ctrl-C ends it.
 demo:
@@ -31,3 +31,10 @@ lint:
 # Read the difference before committing it.
 goldens:
 	@$(WITH_MOSQUITTO) && BLESS=1 exec cargo test --locked
+
+# The release build against a paced wire, about six minutes on an otherwise idle machine; writes
+# docs/performance.md. `make bench ROWS=W1,W8` runs only these, `make bench QUICK=1` takes about a minute.
+bench:
+	@$(WITH_MOSQUITTO) && cargo build --locked --release --bin busker --example bench && \
+		BUSKER_LIBMODBUS_LOOP="$$(scripts/get-libmodbus-loop)" \
+		exec $${CARGO_TARGET_DIR:-target}/release/examples/bench $(if $(QUICK),--quick) $(if $(ROWS),--rows $(ROWS))

@@ -128,7 +128,7 @@ impl ByHand {
         };
         let bus = &settings.buses[device.bus];
         let timeout = device.device.wire.response_timeout.unwrap_or_default().max(bus.response_timeout);
-        open(&bus.link, bus.gap, device.unit, timeout, Some(device.device.clone()))
+        open(&bus.link, bus.gap, device.unit, timeout, Some(Device::clone(&device.device)))
     }
 }
 

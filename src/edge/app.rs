@@ -14,7 +14,7 @@ use crate::edge::files;
 use crate::edge::http::Http;
 use crate::edge::mqtt::{Broker, Mailbox};
 use crate::edge::plant::Plant;
-use crate::edge::reports::{Reporter, Watched};
+use crate::edge::reports::{Detail, Reporter, Watched};
 use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
@@ -110,7 +110,7 @@ impl App {
 
     /// The gateway as it is now. Not from within a runtime.
     pub fn report(&self) -> GatewayReport {
-        self.runtime.block_on(self.reporter.report())
+        self.runtime.block_on(self.reporter.report(Detail::Points))
     }
 
     /// From now on signals are heard, and do not end the program by themselves.
@@ -221,9 +221,15 @@ pub(super) fn watched(
 ) -> Vec<Arc<Watched>> {
     let memories = state.memories();
     let of_bus = |(index, bus): (usize, &Arc<BusHandle>)| {
-        let first = Bus::new(clock.now(), settings, index, &memories).report(clock.now());
+        let first = Bus::new(clock.now(), settings, index, &memories).summary(clock.now());
         let bus = bus.clone();
-        Arc::new(Watched::new(move || bus.inspect(|bus, now| bus.report(now)), first))
+        let ask = move |detail| {
+            bus.inspect(move |bus, now| match detail {
+                Detail::Devices => bus.summary(now),
+                Detail::Points => bus.report(now),
+            })
+        };
+        Arc::new(Watched::new(ask, first))
     };
     buses.iter().enumerate().map(of_bus).collect()
 }
@@ -238,7 +244,7 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
     let mut told_info = info(&plant.settings(), &plant.topics());
     for round in 0u128.. {
         ticks.tick().await;
-        let report = reporter.report().await;
+        let report = reporter.report(Detail::Devices).await;
         if report.buses.iter().all(|bus| bus.responding) {
             shutdown::feed_watchdog();
         }

@@ -14,8 +14,9 @@ use tokio::sync::oneshot;
 
 use crate::edge::bell::Bell;
 use crate::edge::clock::Clock;
-use crate::edge::guarded_link::{GuardedLink, wait};
+use crate::edge::guarded_link::{GuardedLink, Woken, wait};
 use crate::edge::link::{Link, Lost};
+use crate::edge::punctual::Punctual;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Action, Bus, Event, Severity};
 use crate::engine::modbus::Reply;
@@ -66,9 +67,22 @@ pub fn start(
             let bus = Bus::new(clock.now(), &settings, index, &state.memories());
             let port = Port::Closed;
             let (bell, stop) = (thread_bell, thread_stop);
-            let stopping = false;
-            BusThread { settings, index, clock, state, publish, bus, port, inbox, bell, stop, stopping }
-                .run();
+            let (stopping, punctual) = (false, Punctual::default());
+            BusThread {
+                settings,
+                index,
+                clock,
+                state,
+                publish,
+                bus,
+                port,
+                inbox,
+                bell,
+                stop,
+                stopping,
+                punctual,
+            }
+            .run();
         })?;
     Ok(BusHandle { letters, bell, stop, thread: Mutex::new(Some(thread)) })
 }
@@ -140,6 +154,7 @@ struct BusThread {
     bell: Bell,
     stop: Arc<AtomicBool>,
     stopping: bool,
+    punctual: Punctual,
 }
 
 impl BusThread {
@@ -153,10 +168,11 @@ impl BusThread {
             if self.bus.is_finished() {
                 return;
             }
-            self.wait();
-            self.bell.silence();
-            self.read_letters();
-            self.stop_if_asked();
+            if self.wait() {
+                self.bell.silence();
+                self.read_letters();
+                self.stop_if_asked();
+            }
             self.advance_port();
             if self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
                 self.handle(Event::Wake);
@@ -179,6 +195,13 @@ impl BusThread {
                     };
                     self.line_said(begun);
                 }
+                Action::Withdraw => {
+                    if let Port::Open(link) = &mut self.port {
+                        if link.take_back() {
+                            self.bus.handle(self.clock.now(), Event::Withdrawn);
+                        }
+                    }
+                }
                 Action::Publish(message) => (self.publish)(message),
                 Action::Store(record) => self.state.store(record),
                 Action::Reopen { after } => self.port = Port::Waiting(self.clock.now() + after),
@@ -188,17 +211,39 @@ impl BusThread {
         }
     }
 
-    fn wait(&mut self) {
-        let (link, port_wakes_at) = match &self.port {
-            Port::Closed | Port::Opening(_) => (None, None),
-            Port::Waiting(open_at) => (None, Some(*open_at)),
-            Port::Open(link) => (Some(&**link), link.wake_at()),
+    /// Waits for whatever comes first; whether the bell has rung, and there may be letters.
+    fn wait(&mut self) -> bool {
+        let (link, port_wakes_at, send_at) = match &self.port {
+            Port::Closed | Port::Opening(_) => (None, None, None),
+            Port::Waiting(open_at) => (None, Some(*open_at), None),
+            Port::Open(link) => (Some(&**link), link.wake_at(), link.send_at()),
         };
         let wake_at = port_wakes_at.into_iter().chain(self.bus.wake_at()).min();
-        let waited = wait(link, Some(&self.bell), wake_at.map(|at| self.clock.until(at)));
-        if let Err(lost) = waited {
-            self.lose(lost);
+        let exactly = send_at.filter(|at| Some(*at) == wake_at);
+        let until = exactly.map(|at| self.punctual.sleep_until(at)).or(wake_at);
+        let since = self.clock.now();
+        let woken = match wait(link, Some(&self.bell), until.map(|until| until - since)) {
+            Ok(woken) => woken,
+            Err(lost) => {
+                self.lose(lost);
+                return true;
+            }
+        };
+        match (woken, until) {
+            (Woken { link: true, .. }, _) => {
+                if let Port::Open(link) = &mut self.port {
+                    link.woken_by(self.punctual.woken_by(since, self.clock.now()));
+                }
+            }
+            (Woken { bell: false, .. }, Some(until)) => {
+                self.punctual.slept(since, until, self.clock.now());
+                while exactly.is_some_and(|at| self.clock.now() < at) {
+                    std::hint::spin_loop();
+                }
+            }
+            _ => {}
         }
+        woken.bell
     }
 
     fn read_letters(&mut self) {

@@ -18,14 +18,16 @@ pub struct GuardedLink {
     clock: Clock,
     /// A request that has begun and is not yet sent, and when it may be.
     not_before: Option<Time>,
+    /// When what is there to be read came, if that is known to be earlier than now.
+    came_at: Option<Time>,
 }
 
 impl GuardedLink {
     pub fn new(link: Link, guard: Guard, clock: Clock) -> GuardedLink {
-        GuardedLink { link, guard, clock, not_before: None }
+        GuardedLink { link, guard, clock, not_before: None, came_at: None }
     }
 
-    /// Takes a request; it is sent by [`GuardedLink::advance`] when its time has come. A reply at
+    /// Takes a request; it is sent now or by [`GuardedLink::advance`] when its time has come. A reply at
     /// once: it cannot be asked.
     pub fn begin(
         &mut self,
@@ -35,25 +37,45 @@ impl GuardedLink {
     ) -> Result<Option<Reply>, Lost> {
         let reply = self.guard.begin(self.clock.now(), request, timeout);
         self.not_before = if reply.is_none() { Some(not_before) } else { None };
-        usable(reply)
+        match (&self.guard, self.send_at()) {
+            // What is still to be read belongs to older transactions, and says so.
+            (Guard::Tcp(_), Some(at)) if self.clock.now() >= at => self.send_or_wake(),
+            (Guard::Rtu(_), Some(at)) if self.clock.now() >= at => self.advance(),
+            _ => usable(reply),
+        }
     }
 
     /// When to call [`GuardedLink::advance`] although nothing came.
     pub fn wake_at(&self) -> Option<Time> {
-        let send_at = self.not_before.map(|time| time.max(self.guard.earliest_send(self.clock.now())));
-        send_at.or_else(|| self.guard.wake_at())
+        self.send_at().or_else(|| self.guard.wake_at())
+    }
+
+    /// When the request that has begun is to be sent, as exactly as can be.
+    pub fn send_at(&self) -> Option<Time> {
+        self.not_before.map(|time| time.max(self.guard.earliest_send(self.clock.now())))
+    }
+
+    /// What is there to be read came by this time at the latest.
+    pub fn woken_by(&mut self, time: Time) {
+        self.came_at = Some(time);
     }
 
     /// Does what is due: reads, sends, tells the guard the time. Never waits.
     pub fn advance(&mut self) -> Result<Option<Reply>, Lost> {
         let mut buffer = [0; 512];
+        let mut came_at = self.came_at.take();
         for _ in 0..READS_MAX {
             let Some(count) = self.link.read(&mut buffer)? else { break };
-            let reply = self.guard.received(self.clock.now(), &buffer[..count]);
+            let time = came_at.take().unwrap_or_else(|| self.clock.now());
+            let reply = self.guard.received(time, &buffer[..count]);
             if reply.is_some() {
                 return usable(reply);
             }
         }
+        self.send_or_wake()
+    }
+
+    fn send_or_wake(&mut self) -> Result<Option<Reply>, Lost> {
         let now = self.clock.now();
         match self.not_before {
             Some(not_before) if now >= not_before.max(self.guard.earliest_send(now)) => {
@@ -67,6 +89,11 @@ impl GuardedLink {
             None if self.guard.wake_at().is_some_and(|at| now >= at) => usable(self.guard.wake(now)),
             None => Ok(None),
         }
+    }
+
+    /// Takes a request back that is not yet sent, as if it had never begun; `false` if it is on the wire.
+    pub fn take_back(&mut self) -> bool {
+        self.not_before.take().is_some()
     }
 
     /// Ends a request that is not yet sent; one on the wire goes on.
@@ -97,13 +124,30 @@ fn usable(reply: Option<Reply>) -> Result<Option<Reply>, Lost> {
     }
 }
 
+/// What ended a wait; neither: the time.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Woken {
+    pub bell: bool,
+    pub link: bool,
+}
+
 /// Waits until bytes come, the bell rings or `timeout` has passed; `None`: for ever.
-pub fn wait(link: Option<&GuardedLink>, bell: Option<&Bell>, timeout: Option<Duration>) -> Result<(), Lost> {
+pub fn wait(
+    link: Option<&GuardedLink>,
+    bell: Option<&Bell>,
+    timeout: Option<Duration>,
+) -> Result<Woken, Lost> {
     let mut descriptors: Vec<PollFd<'_>> = Vec::with_capacity(2);
     descriptors.extend(bell.map(|bell| PollFd::new(bell, PollFlags::IN)));
     descriptors.extend(link.map(|link| PollFd::new(&link.link, PollFlags::IN)));
     match poll(&mut descriptors, timeout.map(timespec).as_ref()) {
-        Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
+        Ok(_) => {
+            let mut called = descriptors.iter().map(|descriptor| !descriptor.revents().is_empty());
+            let bell = bell.is_some() && called.next() == Some(true);
+            Ok(Woken { bell, link: called.next() == Some(true) })
+        }
+        // It may be for anything.
+        Err(rustix::io::Errno::INTR) => Ok(Woken { bell: true, link: true }),
         Err(error) => Err(Lost(error.to_string())),
     }
 }

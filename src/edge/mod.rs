@@ -11,6 +11,7 @@ pub mod link;
 pub mod metrics;
 pub mod mqtt;
 pub mod plant;
+pub mod punctual;
 pub mod reload;
 pub mod reports;
 pub mod secrets;

@@ -12,7 +12,15 @@ use crate::engine::time::Duration;
 const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 
 /// Asks a bus, which answers through the channel.
-pub type Ask = Box<dyn Fn() -> oneshot::Receiver<BusReport> + Send + Sync>;
+pub type Ask = Box<dyn Fn(Detail) -> oneshot::Receiver<BusReport> + Send + Sync>;
+
+/// How much is asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Detail {
+    /// No points. They are most of a report, and few ask for them.
+    Devices,
+    Points,
+}
 
 /// A bus that is asked how it is.
 pub struct Watched {
@@ -24,7 +32,7 @@ pub struct Watched {
 impl Watched {
     /// `first` is how the bus is before it has said anything.
     pub fn new(
-        ask: impl Fn() -> oneshot::Receiver<BusReport> + Send + Sync + 'static,
+        ask: impl Fn(Detail) -> oneshot::Receiver<BusReport> + Send + Sync + 'static,
         first: BusReport,
     ) -> Watched {
         Watched { ask: Box::new(ask), last: Mutex::new(first) }
@@ -62,23 +70,51 @@ impl Reporter {
     }
 
     /// The gateway as it is now; takes a second if a bus is stuck, and no longer if several are.
-    pub async fn report(&self) -> GatewayReport {
+    pub async fn report(&self, detail: Detail) -> GatewayReport {
         let deadline = Instant::now() + ANSWER_WITHIN;
         let watched = lock(&self.buses).clone();
-        let answers: Vec<oneshot::Receiver<BusReport>> = watched.iter().map(|bus| (bus.ask)()).collect();
+        let answers: Vec<oneshot::Receiver<BusReport>> =
+            watched.iter().map(|bus| (bus.ask)(detail)).collect();
         let mut buses = Vec::new();
         for (bus, answer) in watched.iter().zip(answers) {
             let answer = timeout_at(deadline, answer).await.ok().and_then(Result::ok);
             let responding = answer.is_some();
             let mut last = lock(&bus.last);
-            if let Some(report) = answer {
-                *last = report;
-            }
-            buses.push(BusHealth { report: last.clone(), responding });
+            let report = match (answer, detail) {
+                (Some(report), Detail::Points) => {
+                    *last = report.clone();
+                    report
+                }
+                (Some(report), Detail::Devices) => {
+                    keep_points(&mut last, report.clone());
+                    report
+                }
+                (None, Detail::Points) => last.clone(),
+                (None, Detail::Devices) => without_points(last.clone()),
+            };
+            buses.push(BusHealth { report, responding });
         }
         let configuration_error = lock(&self.configuration_error).clone();
         GatewayReport { broker: (self.broker)(), buses, configuration_error }
     }
+}
+
+/// What was last said of the points is kept for when the bus is stuck.
+fn keep_points(last: &mut BusReport, mut report: BusReport) {
+    let before = std::mem::take(&mut last.devices);
+    for (device, before) in report.devices.iter_mut().zip(before) {
+        if device.name == before.name {
+            (device.points, device.things) = (before.points, before.things);
+        }
+    }
+    *last = report;
+}
+
+fn without_points(mut report: BusReport) -> BusReport {
+    for device in &mut report.devices {
+        (device.points, device.things) = Default::default();
+    }
+    report
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -107,24 +143,24 @@ mod tests {
     #[test]
     fn a_bus_that_does_not_answer_is_stuck_and_told_as_it_last_was() {
         let kept = Mutex::new(Vec::new());
-        let good: Ask = Box::new(|| {
+        let good: Ask = Box::new(|_| {
             let (answer, receiver) = oneshot::channel();
             answer.send(bus("good", 7)).expect("somebody listens");
             receiver
         });
         // As long as the sender lives there is hope.
-        let silent: Ask = Box::new(move || {
+        let silent: Ask = Box::new(move |_| {
             let (answer, receiver) = oneshot::channel();
             kept.lock().expect("nobody panicked").push(answer);
             receiver
         });
-        let gone: Ask = Box::new(|| oneshot::channel().1);
+        let gone: Ask = Box::new(|_| oneshot::channel().1);
         let broker = || BrokerReport { connected: true, ..BrokerReport::default() };
         let asks = [(silent, bus("silent", 1)), (good, bus("good", 2)), (gone, bus("gone", 3))];
         let watched = asks.map(|(ask, first)| Arc::new(Watched { ask, last: Mutex::new(first) }));
         let reporter = Reporter::new(broker, watched.to_vec());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-        let report = runtime.expect("a runtime").block_on(reporter.report());
+        let report = runtime.expect("a runtime").block_on(reporter.report(Detail::Devices));
         let told: Vec<(&str, bool, u64)> = report
             .buses
             .iter()

@@ -154,6 +154,14 @@ pub fn words_at(address: Address, first: u16, words: &[u16]) -> Option<Vec<u16>>
     }
 }
 
+/// Whether two answers to one read that began at `first` hold the same at this place.
+pub fn are_equal_at(address: Address, first: u16, before: &[u16], words: &[u16]) -> bool {
+    let Some(start) = address.span.first().checked_sub(first).map(usize::from) else { return false };
+    let place = start..start + address.span.count() as usize;
+    let pair = before.get(place.clone()).zip(words.get(place));
+    pair.is_some_and(|(before, now)| before == now)
+}
+
 /// The raw field that `words` hold in this form.
 pub fn raw(form: &Form, words: &[u16]) -> Raw {
     let count = usize::from(form.kind.registers());

@@ -158,6 +158,11 @@ impl CommandFlow {
         matches!(self.state, State::ReadingBefore { .. } | State::ReadingBack { .. })
     }
 
+    /// Whether all that is left is to see that the device has taken what it has confirmed.
+    pub fn only_confirms(&self) -> bool {
+        matches!(self.state, State::ReadingBack { doubt: None, .. })
+    }
+
     /// Takes the answer to the last question.
     pub fn answered(
         &mut self,

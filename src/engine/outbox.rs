@@ -13,6 +13,9 @@ use crate::engine::topics::{self, Message, OFFLINE, ONLINE, Topics};
 /// Messages told once that may wait; more push out the oldest.
 const ONCE_MAX: usize = 256;
 
+/// The empty queue keeps room for so many.
+const QUEUE_KEPT: usize = 1024;
+
 /// Home Assistant subscribes to the states of a new entity only some time after it was announced,
 /// and takes no notice of what comes before (0.4 s were too short, 0.8 s long enough).
 const STATES_AFTER_DISCOVERY: Duration = Duration::from_millis(1500);
@@ -120,7 +123,12 @@ impl Outbox {
 
     fn take_first(&mut self) -> Option<Message> {
         loop {
-            match self.queue.pop_front()? {
+            let Some(next) = self.queue.pop_front() else {
+                // After a start or a reconnect everything was in it at once.
+                self.queue.shrink_to(QUEUE_KEPT);
+                return None;
+            };
+            match next {
                 Queued::Once(message) => {
                     self.once_waiting -= 1;
                     return Some(message);

@@ -4,7 +4,9 @@
 //! every period therefore stretches by the same factor, and nothing starves. Reads that are wanted at
 //! once (after a connect, after a write, on request) come before all of them, selectors first.
 
-use crate::engine::address::Span;
+use std::sync::Arc;
+
+use crate::engine::address::{Address, Span};
 use crate::engine::device::{Intervals, PointIndex, Poll};
 use crate::engine::plan::Read;
 use crate::engine::time::{Duration, Time};
@@ -17,7 +19,7 @@ pub struct Polls {
 
 #[derive(Clone, Debug)]
 struct Planned {
-    read: Read,
+    read: Arc<Read>,
     /// `None`: only after a connect or on request.
     period: Option<Duration>,
     /// Some point in it decides how others are read.
@@ -34,6 +36,13 @@ struct Planned {
     paused_until: Time,
     /// Holds nothing that lives now.
     sleeps: bool,
+}
+
+/// Where a read stands in the schedule.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Place {
+    began_at: Option<Time>,
+    wanted_now: bool,
 }
 
 /// How much a read is wanted; the greatest is next.
@@ -55,7 +64,7 @@ impl Polls {
                 Poll::Once | Poll::Never => None,
             },
             has_selector: read.points.iter().any(|(point, _)| is_selector(*point)),
-            read,
+            read: Arc::new(read),
             began_at: None,
             sent_at: None,
             real_period: None,
@@ -71,6 +80,11 @@ impl Polls {
         &self.reads[index].read
     }
 
+    /// The same, for longer than the schedule can be borrowed.
+    pub fn shared_read(&self, index: usize) -> Arc<Read> {
+        self.reads[index].read.clone()
+    }
+
     /// The most urgent read that may begin now.
     pub fn most_urgent(&self, now: Time) -> Option<(usize, Urgency)> {
         let mut best: Option<(usize, Urgency)> = None;
@@ -83,14 +97,21 @@ impl Polls {
         best
     }
 
+    /// Whether a read that is sent now and then takes `point` from this place.
+    pub fn reads_at(&self, point: PointIndex, place: Address) -> bool {
+        let holds = |planned: &Planned| planned.read.points.contains(&(point, place)) && !planned.sleeps;
+        self.reads.iter().any(holds)
+    }
+
     /// When the next read will be due, if nothing asks for one before.
     pub fn due_at(&self) -> Option<Time> {
         self.reads.iter().filter_map(Planned::due_at).min()
     }
 
-    /// The read is being sent.
-    pub fn begin(&mut self, index: usize, now: Time) {
+    /// The read is being sent; returns where it stood before.
+    pub fn begin(&mut self, index: usize, now: Time) -> Place {
         let planned = &mut self.reads[index];
+        let before = Place { began_at: planned.began_at, wanted_now: planned.wanted_now };
         // A read that begins a little late does not shift those after it: the period is kept on average.
         let on_time =
             planned.began_at.zip(planned.period).map(|(began_at, period)| (began_at + period, period));
@@ -104,6 +125,14 @@ impl Polls {
         }
         planned.sent_at = Some(now);
         planned.wanted_now = false;
+        before
+    }
+
+    /// The read was not sent after all.
+    pub fn take_back(&mut self, index: usize, before: Place) {
+        let planned = &mut self.reads[index];
+        planned.began_at = before.began_at;
+        planned.wanted_now |= before.wanted_now;
     }
 
     /// The poll class's period as the bus keeps it now: that of the slowest of its reads, a read that
@@ -216,7 +245,7 @@ impl Planned {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::address::{Address, Table};
+    use crate::engine::address::Table;
 
     fn polls(periods: &[Poll]) -> Polls {
         let reads = periods

@@ -3,6 +3,7 @@
 
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::engine::address::Span;
 use crate::engine::device::{Device, PointIndex};
@@ -244,8 +245,8 @@ pub struct DeviceSettings {
     /// Index into [`Settings::buses`].
     pub bus: usize,
     pub unit: u8,
-    /// The profile with this device's own wishes applied.
-    pub device: Device,
+    /// The profile with this device's own wishes applied; the same one for all that wish the same.
+    pub device: Arc<Device>,
     /// What its settings shall hold, in the file's order; each point once.
     pub wanted: Vec<Wanted>,
     /// What a `write` request may write as it is, past the profile's rules.

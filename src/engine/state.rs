@@ -1,7 +1,10 @@
 //! What is known of a device's points, and what of it is worth telling.
 
+use std::collections::BTreeMap;
+
+use crate::engine::address::{Address, Span};
 use crate::engine::codec::{self, Raw};
-use crate::engine::device::{Device, Point, PointIndex};
+use crate::engine::device::{Device, Point, PointIndex, Poll};
 use crate::engine::plan::Read;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::{Missing, Reading};
@@ -12,12 +15,25 @@ pub struct Values {
     values: Vec<Value>,
     /// The raw fields by which other points are read; see [`codec::resolve`].
     known: Vec<Option<i128>>,
-    /// For each point, those that it decides.
-    dependents: Vec<Vec<PointIndex>>,
+    /// For each point that decides about others, those.
+    dependents: BTreeMap<PointIndex, Vec<PointIndex>>,
     /// Whether a point decides about anything: other points, things, or a heartbeat.
     decides: Vec<bool>,
     /// What is missing, or why, has changed since it was last asked.
     missing_changed: bool,
+    /// What each poll brought last. Words that have not changed need not be understood again.
+    heard: Vec<Heard>,
+    /// Counts what makes equal words mean something else: a selector, a loss, a reading from elsewhere.
+    meaning: u64,
+}
+
+/// The words of a read, and the count of meanings under which they were understood.
+#[derive(Clone, Debug)]
+struct Heard {
+    span: Span,
+    poll: Poll,
+    meaning: u64,
+    words: Vec<u16>,
 }
 
 #[derive(Clone, Debug)]
@@ -25,6 +41,8 @@ struct Value {
     reading: Reading,
     read_at: Option<Time>,
     told: Option<(Reading, Time)>,
+    /// Has changed since it was last asked whether that is worth telling.
+    is_news: bool,
 }
 
 /// What a read has brought.
@@ -42,25 +60,33 @@ impl Values {
     /// Nothing is known yet.
     pub fn new(device: &Device) -> Values {
         let count = device.points.len();
-        let mut dependents = vec![Vec::new(); count];
+        let mut dependents: BTreeMap<PointIndex, Vec<PointIndex>> = BTreeMap::new();
+        let mut decides = vec![false; count];
         for (index, point) in device.points.iter().enumerate() {
             for selector in point.selectors() {
-                dependents[selector].push(index);
+                dependents.entry(selector).or_default().push(index);
+                decides[selector] = true;
             }
         }
-        let mut decides: Vec<bool> = dependents.iter().map(|dependents| !dependents.is_empty()).collect();
         let conditions = device.things.iter().flat_map(|thing| &thing.when);
         let others = conditions.map(|condition| condition.point);
         others
             .chain(device.points.iter().filter_map(|point| point.heartbeat))
             .for_each(|point| decides[point] = true);
-        let unknown = Value { reading: Reading::Missing(Missing::NotYetRead), read_at: None, told: None };
+        let unknown = Value {
+            reading: Reading::Missing(Missing::NotYetRead),
+            read_at: None,
+            told: None,
+            is_news: true,
+        };
         Values {
             values: vec![unknown; count],
             known: vec![None; count],
             dependents,
             decides,
             missing_changed: true,
+            heard: Vec::new(),
+            meaning: 0,
         }
     }
 
@@ -82,34 +108,91 @@ impl Values {
         self.decides[point]
     }
 
+    /// Takes in the words of a poll that began after every write before it. As [`Values::absorb`], but
+    /// what has not changed since the poll before is not understood again.
+    pub fn absorb_poll(&mut self, now: Time, device: &Device, read: &Read, words: &[u16]) -> Absorbed {
+        let is_same = |heard: &Heard| heard.span == read.span && heard.poll == read.poll;
+        let before = match self.heard.iter().position(is_same) {
+            Some(at) => Some(self.heard.swap_remove(at)),
+            None => None,
+        };
+        let known = before.as_ref().filter(|heard| heard.meaning == self.meaning);
+        let absorbed = self.take_in(now, device, read, words, known.map(|heard| &heard.words[..]));
+        let mut heard = before.map_or(Vec::new(), |heard| heard.words);
+        heard.clear();
+        heard.extend_from_slice(words);
+        self.heard.push(Heard { span: read.span, poll: read.poll, meaning: self.meaning, words: heard });
+        absorbed
+    }
+
     /// Takes in the words of a read that began after every write before it. Selectors come first:
     /// what a selector decides is never understood by what it said before.
     pub fn absorb(&mut self, now: Time, device: &Device, read: &Read, words: &[u16]) -> Absorbed {
+        let absorbed = self.take_in(now, device, read, words, None);
+        // A poll that brings again what it brought before this is news.
+        self.meaning += 1;
+        absorbed
+    }
+
+    /// `before`: words that were understood as these are, and brought the present readings.
+    fn take_in(
+        &mut self,
+        now: Time,
+        device: &Device,
+        read: &Read,
+        words: &[u16],
+        before: Option<&[u16]>,
+    ) -> Absorbed {
         let mut absorbed = Absorbed::default();
-        let (selectors, others): (Vec<_>, Vec<_>) =
-            read.points.iter().copied().partition(|(point, _)| self.is_selector(*point));
-        for (point, address) in selectors.into_iter().chain(others) {
-            let Some(field) = codec::words_at(address, read.span.first(), words) else { continue };
-            let known = known_field(&device.points[point], &field);
-            if self.is_selector(point) && self.known[point] != known {
-                self.known[point] = known;
-                absorbed.decided = true;
-                self.drop_dependents(device, point, &mut absorbed.dropped);
-            }
-            let reading = match codec::resolve(device, point, &self.known) {
-                Ok(resolved) => codec::read(&resolved, &field),
-                Err(missing) => Reading::Missing(missing),
-            };
-            if let Reading::Missing(Missing::UnknownValue(raw)) = reading {
-                if self.values[point].reading != reading {
-                    absorbed.unnamed.push((point, raw));
+        let meaning = self.meaning;
+        for selectors in [true, false] {
+            for (point, address) in &read.points {
+                let point = *point;
+                if self.is_selector(point) != selectors {
+                    continue;
+                }
+                let before = before.filter(|_| self.meaning == meaning);
+                if before
+                    .is_some_and(|before| codec::are_equal_at(*address, read.span.first(), before, words))
+                {
+                    self.values[point].read_at = Some(now);
+                } else {
+                    self.understand(now, device, read, words, (point, *address), &mut absorbed);
                 }
             }
-            self.set(point, reading);
-            self.values[point].read_at = Some(now);
-            absorbed.dropped.retain(|dropped| *dropped != point);
         }
         absorbed
+    }
+
+    fn understand(
+        &mut self,
+        now: Time,
+        device: &Device,
+        read: &Read,
+        words: &[u16],
+        (point, address): (PointIndex, Address),
+        absorbed: &mut Absorbed,
+    ) {
+        let Some(field) = codec::words_at(address, read.span.first(), words) else { return };
+        let known = known_field(&device.points[point], &field);
+        if self.is_selector(point) && self.known[point] != known {
+            self.known[point] = known;
+            self.meaning += 1;
+            absorbed.decided = true;
+            self.drop_dependents(device, point, &mut absorbed.dropped);
+        }
+        let reading = match codec::resolve(device, point, &self.known) {
+            Ok(resolved) => codec::read(&resolved, &field),
+            Err(missing) => Reading::Missing(missing),
+        };
+        if let Reading::Missing(Missing::UnknownValue(raw)) = reading {
+            if self.values[point].reading != reading {
+                absorbed.unnamed.push((point, raw));
+            }
+        }
+        self.set(point, reading);
+        self.values[point].read_at = Some(now);
+        absorbed.dropped.retain(|dropped| *dropped != point);
     }
 
     /// A write to `point` is on its way: whatever it decides is not understood until it has been read
@@ -117,12 +200,13 @@ impl Values {
     pub fn forget_selector(&mut self, device: &Device, point: PointIndex) {
         if self.is_selector(point) {
             self.known[point] = None;
+            self.meaning += 1;
             self.drop_dependents(device, point, &mut Vec::new());
         }
     }
 
     fn drop_dependents(&mut self, device: &Device, selector: PointIndex, dropped: &mut Vec<PointIndex>) {
-        for dependent in self.dependents[selector].clone() {
+        for dependent in self.dependents.get(&selector).cloned().unwrap_or_default() {
             let missing = match codec::resolve(device, dependent, &self.known) {
                 Ok(_) => Missing::NotYetRead,
                 Err(missing) => missing,
@@ -140,12 +224,14 @@ impl Values {
 
     /// There is no reading of this point now.
     pub fn lose(&mut self, point: PointIndex, missing: Missing) {
+        self.meaning += 1;
         self.set(point, Reading::Missing(missing));
     }
 
     /// The device is gone, and with it everything that was known of it.
     pub fn lose_all(&mut self, missing: Missing) {
         self.known.fill(None);
+        self.meaning += 1;
         for point in 0..self.values.len() {
             self.set(point, Reading::Missing(missing.clone()));
         }
@@ -154,8 +240,10 @@ impl Values {
     fn set(&mut self, point: PointIndex, reading: Reading) {
         let before = std::mem::replace(&mut self.values[point].reading, reading);
         let is_missing = |reading: &Reading| matches!(reading, Reading::Missing(_));
-        let now = &self.values[point].reading;
-        self.missing_changed |= (is_missing(&before) || is_missing(now)) && before != *now;
+        let value = &mut self.values[point];
+        let has_changed = before != value.reading;
+        value.is_news |= has_changed;
+        self.missing_changed |= (is_missing(&before) || is_missing(&value.reading)) && has_changed;
     }
 
     /// Whether what is missing, or why, has changed since this was last called.
@@ -174,6 +262,12 @@ impl Values {
         }
     }
 
+    /// Whether there is any reason to look closer: it has changed, or was last told long ago.
+    pub fn may_be_told(&self, now: Time, point: PointIndex, republish: Duration) -> bool {
+        let value = &self.values[point];
+        value.is_news || value.told.as_ref().is_none_or(|(_, told_at)| now - *told_at >= republish)
+    }
+
     /// The text to publish for this point now: if it differs from what was told last (by at least the
     /// deadband), if what was told is older than `republish`, or if `anyway`.
     pub fn tell(
@@ -185,13 +279,14 @@ impl Values {
         anyway: bool,
     ) -> Option<String> {
         let value = &mut self.values[point];
+        let is_news = std::mem::take(&mut value.is_news);
         let worth_telling = match &value.told {
             None => true,
             Some((told, told_at)) => {
                 // What was told at this very moment need not be told twice.
                 (anyway && *told_at < now)
                     || now - *told_at >= republish
-                    || differs(told, &value.reading, details)
+                    || (is_news && differs(told, &value.reading, details))
             }
         };
         if !worth_telling {

@@ -121,7 +121,7 @@ fn payload(device: &Device, known: &[Option<i128>]) -> Value {
         title: "Device".into(),
         bus: 0,
         unit: 1,
-        device: device.clone(),
+        device: device.clone().into(),
         wanted: Vec::new(),
         raw_write: Vec::new(),
     };

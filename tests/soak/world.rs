@@ -197,6 +197,11 @@ impl World {
                         None => self.to_send = Some(not_before),
                     }
                 }
+                Action::Withdraw => {
+                    if self.to_send.take().is_some() {
+                        self.bus.handle(self.now, Event::Withdrawn);
+                    }
+                }
                 Action::Publish(message) => {
                     self.published.push(Published { message, at: self.now, asked_at: self.asked_at });
                 }

@@ -26,7 +26,7 @@ pub fn settings(header: &str) -> Settings {
                 title: name.into(),
                 bus: 0,
                 unit: unit.parse().expect("a unit"),
-                device: device(kind),
+                device: device(kind).into(),
                 wanted: Vec::new(),
                 raw_write: Vec::new(),
             });

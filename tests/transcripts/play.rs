@@ -56,6 +56,7 @@ struct Player {
     silent: Vec<u8>,
     /// Holding register 0 is kept below holding register 1.
     clamps: bool,
+    is_unsent: bool,
     /// While devices answer by themselves, requests are counted instead of written down.
     asked: BTreeMap<String, u32>,
 }
@@ -80,6 +81,7 @@ impl Player {
             answering: false,
             silent: Vec::new(),
             clamps: false,
+            is_unsent: false,
             asked: BTreeMap::new(),
         };
         player.take_actions();
@@ -113,6 +115,9 @@ impl Player {
             "setting" => self.change_setting(rest),
             "nothing-is-kept" => self.memories.unkept = Some("the card is full".into()),
             "clamps" => self.clamps = true,
+            // The request in flight waits for the line to be silent.
+            "line-is-busy" => self.is_unsent = true,
+            "line-is-silent" => self.is_unsent = false,
             "shutdown" => self.bus.handle(self.now, Event::Shutdown),
             "set" | "retained-set" => {
                 let (place, payload) = rest.split_once(' ').expect("set device/point value");
@@ -211,6 +216,14 @@ impl Player {
                         self.write(&format!("-> {text}   timeout {}", timeout.as_millis()));
                     }
                     self.in_flight = Some((request, not_before.max(self.now), timeout));
+                }
+                // What is on the wire stays there.
+                Action::Withdraw if !self.is_unsent => {}
+                Action::Withdraw => {
+                    if let Some((request, ..)) = self.in_flight.take() {
+                        self.write(&format!("taken back: {} {}", request.unit, request.call));
+                        self.bus.handle(self.now, Event::Withdrawn);
+                    }
                 }
                 Action::Publish(message) => {
                     let retained = if message.retain { "" } else { " (not retained)" };

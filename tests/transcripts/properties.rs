@@ -122,6 +122,11 @@ impl Observed {
                     assert!(self.in_flight.is_none(), "two requests in flight");
                     self.in_flight = Some(request);
                 }
+                // Every other request is not yet on the wire.
+                Action::Withdraw if self.commands % 2 == 0 => {
+                    self.in_flight = None;
+                    self.bus.handle(self.now, Event::Withdrawn);
+                }
                 Action::Publish(message) if message.topic.ends_with("/outcome") => self.outcomes += 1,
                 Action::Publish(message) if message.topic.contains("/response/") => {
                     self.responses += usize::from(!message.payload.contains(r#""status":"progress""#));

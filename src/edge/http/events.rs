@@ -15,7 +15,7 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::edge::clock::Clock;
-use crate::edge::reports::Reporter;
+use crate::edge::reports::{Detail, Reporter};
 use crate::engine::feed::{self, Look, News};
 use crate::engine::time::{Duration, Time};
 
@@ -103,7 +103,7 @@ pub async fn tell(hub: Arc<Hub>, reporter: Arc<Reporter>, clock: Clock) {
                 }
             }
         }
-        let report = reporter.report().await;
+        let report = reporter.report(Detail::Points).await;
         // After the answer: what a stuck bus said last has grown older while we waited for it.
         let look = Look { at: clock.now(), report };
         let news = last.as_ref().map_or_else(Vec::new, |last| feed::changes(last, &look));

@@ -20,7 +20,7 @@ use tokio::task::JoinHandle;
 
 use crate::edge::clock::Clock;
 use crate::edge::metrics;
-use crate::edge::reports::Reporter;
+use crate::edge::reports::{Detail, Reporter};
 use crate::engine::health::Status;
 use door::Door;
 use events::Hub;
@@ -95,7 +95,7 @@ struct Shared {
 }
 
 async fn health(State(shared): State<Shared>) -> Response {
-    let report = shared.reporter.report().await;
+    let report = shared.reporter.report(Detail::Devices).await;
     let code = match report.status() {
         Status::Ok | Status::Degraded => StatusCode::OK,
         Status::Lost => StatusCode::SERVICE_UNAVAILABLE,
@@ -104,20 +104,20 @@ async fn health(State(shared): State<Shared>) -> Response {
 }
 
 async fn metrics(State(shared): State<Shared>) -> Response {
-    match metrics::render(&shared.reporter.report().await) {
+    match metrics::render(&shared.reporter.report(Detail::Devices).await) {
         Ok(text) => ([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response(),
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
     }
 }
 
 async fn devices(State(shared): State<Shared>) -> Response {
-    let report = shared.reporter.report().await;
+    let report = shared.reporter.report(Detail::Points).await;
     // After the answer: what a stuck bus said last has grown older while we waited for it.
     Json(report.devices_json(shared.clock.now())).into_response()
 }
 
 async fn buses(State(shared): State<Shared>) -> Response {
-    Json(shared.reporter.report().await.buses_json()).into_response()
+    Json(shared.reporter.report(Detail::Devices).await.buses_json()).into_response()
 }
 
 async fn events(State(shared): State<Shared>) -> Response {

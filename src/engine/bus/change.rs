@@ -70,7 +70,7 @@ impl Bus {
             change(device);
         }
         self.active.iter_mut().for_each(|active| change(&mut active.device));
-        self.settling.iter_mut().for_each(|(_, active)| change(&mut active.device));
+        self.settling.iter_mut().for_each(|settling| change(&mut settling.active.device));
         self.beat.iter_mut().for_each(|(device, ..)| change(device));
         self.waiting.iter_mut().for_each(|waiting| change(&mut waiting.device));
         self.fetches.iter_mut().for_each(|fetch| change(&mut fetch.device));
@@ -88,5 +88,6 @@ impl Bus {
             }
             self.devices.push(device);
         }
+        self.look_what_they_have();
     }
 }

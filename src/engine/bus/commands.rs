@@ -3,10 +3,11 @@
 
 use std::collections::VecDeque;
 
+use crate::engine::address::Span;
 use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
 use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, RequestError};
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
 use super::device::DeviceState;
@@ -22,6 +23,19 @@ pub(super) struct Active {
     /// What of a thing's command is still to be written.
     orders: VecDeque<(PointIndex, String)>,
 }
+
+/// A command that was written and waits until it can be read back.
+pub(super) struct Settling {
+    /// When it is read back with a request of its own.
+    until: Time,
+    pub(super) active: Active,
+    /// A poll that begins from now on answers as well.
+    by_poll: bool,
+}
+
+/// The poll that reads a command back is wanted at once. When even so it does not come within this time,
+/// the command is read back by itself.
+const POLL_AWAITED: Duration = Duration::from_secs(1);
 
 impl Bus {
     /// A message on a `set` topic.
@@ -64,9 +78,9 @@ impl Bus {
             let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, "busker stops");
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
-        self.end_settling("written, but not read back: busker stops");
         self.refuse_requests();
         if self.in_flight.is_none() {
+            self.end_settling("written, but not read back: busker stops");
             for device in &mut self.devices {
                 device.say_offline(&mut self.context);
             }
@@ -82,9 +96,9 @@ impl Bus {
     pub(super) fn end_settling_of(&mut self, device: Option<usize>, reason: &str) {
         let is_of_it = |active: &Active| device.is_none_or(|device| active.device == device);
         let all = std::mem::take(&mut self.settling).into_iter();
-        let (ended, rest): (Vec<_>, Vec<_>) = all.partition(|(_, active)| is_of_it(active));
+        let (ended, rest): (Vec<_>, Vec<_>) = all.partition(|settling| is_of_it(&settling.active));
         self.settling = rest;
-        for (_, active) in ended {
+        for Settling { active, .. } in ended {
             let outcome = Outcome::new(OutcomeKind::NoReply, &active.wanted, reason);
             self.end_command(active, outcome);
         }
@@ -96,8 +110,8 @@ impl Bus {
         if self.active.is_some() {
             return false;
         }
-        if let Some(at) = self.settling.iter().position(|(at, _)| *at <= self.now) {
-            let (_, mut active) = self.settling.remove(at);
+        if let Some(at) = self.settling.iter().position(|settling| settling.until <= self.now) {
+            let Settling { mut active, .. } = self.settling.remove(at);
             let call = active.flow.settled(self.devices[active.device].device());
             let device = active.device;
             self.active = Some(active);
@@ -105,14 +119,7 @@ impl Bus {
             return true;
         }
         let (devices, settling, now) = (&self.devices, &self.settling, self.now);
-        let is_settling = |device: usize, point: PointIndex| {
-            settling.iter().any(|(_, active)| active.device == device && active.flow.point() == point)
-        };
-        let can_begin = |waiting: &Waiting| {
-            let device = &devices[waiting.device];
-            device.can_take(now, waiting.target, &waiting.wanted)
-                && !device.written_by(waiting.target).iter().any(|point| is_settling(waiting.device, *point))
-        };
+        let can_begin = |waiting: &Waiting| can_begin(devices, settling, now, waiting);
         let Some(waiting) = self.waiting.take_first(can_begin) else { return false };
         let Waiting { device, target, wanted, .. } = waiting;
         let orders = match target {
@@ -129,17 +136,23 @@ impl Bus {
         true
     }
 
+    /// Whether a waiting command could begin if nothing were in flight.
+    pub(super) fn command_can_begin(&self) -> bool {
+        let can_begin = |waiting: &Waiting| can_begin(&self.devices, &self.settling, self.now, waiting);
+        self.active.is_none() && self.waiting.iter().any(can_begin)
+    }
+
     /// Begins to write a setting that a device holds otherwise than it is wanted. Whether anything was
     /// done. Many settings take their time, in which watchdogs want to be fed: after each, what is due
     /// comes first.
     pub(super) fn begin_setting(&mut self) -> bool {
-        if self.active.is_some() || self.wrote_setting {
+        if !self.has_settings || self.active.is_some() || self.wrote_setting {
             return false;
         }
         let next = |(index, device): (usize, &DeviceState)| {
             let is_settling = |point| {
                 let same = |active: &Active| active.device == index && active.flow.point() == point;
-                self.settling.iter().any(|(_, active)| same(active))
+                self.settling.iter().any(|settling| same(&settling.active))
             };
             Some((index, device.next_setting(self.now, is_settling)?))
         };
@@ -185,6 +198,10 @@ impl Bus {
     fn take_step(&mut self, active: Active, step: Step) {
         let (device, point) = (active.device, active.flow.point());
         match step {
+            Step::Ask(_) if self.next_poll_confirms(&active) => {
+                self.devices[device].want_poll(point);
+                self.settling.push(Settling { until: self.now + POLL_AWAITED, active, by_poll: true });
+            }
             Step::Ask(call) => {
                 if let (true, Some(reason)) =
                     (call.is_write(), self.devices[device].is_spent(self.now, point))
@@ -202,7 +219,9 @@ impl Bus {
                 self.active = Some(active);
                 self.send(device, call, Purpose::Command);
             }
-            Step::Settle(time) => self.settling.push((self.now + time, active)),
+            Step::Settle(time) => {
+                self.settling.push(Settling { until: self.now + time, active, by_poll: false });
+            }
             Step::Finished(outcome) => {
                 let is_done = matches!(outcome.kind, OutcomeKind::Done | OutcomeKind::Unchanged);
                 if is_done && !active.orders.is_empty() {
@@ -213,6 +232,41 @@ impl Bus {
                     self.end_command(active, outcome);
                 }
             }
+        }
+    }
+
+    /// Whether the next poll will read back what was written, so that no request of its own is needed. A
+    /// fast point is polled soon anyway; what decides about others is read at once.
+    fn next_poll_confirms(&self, active: &Active) -> bool {
+        let device = &self.devices[active.device];
+        let is_point = matches!(active.target, Target::Point(_));
+        // Where polls end soon, what has begun is still brought to its end.
+        let goes_on = !self.stopping && !device.is_leaving && self.requests.pause.is_none();
+        goes_on && is_point && active.flow.only_confirms() && device.is_polled_fast(active.flow.point())
+    }
+
+    /// A poll of a device has brought these words for `span`, or nothing.
+    pub(super) fn poll_ended(&mut self, device: usize, span: Span, words: Option<&[u16]>) {
+        let is_read_back = |settling: &Settling, devices: &[DeviceState]| {
+            let is_of_it = settling.by_poll && settling.active.device == device;
+            is_of_it && span.contains(devices[device].details(settling.active.flow.point()).at.span)
+        };
+        let Some(words) = words else {
+            for settling in &mut self.settling {
+                if is_read_back(settling, &self.devices) {
+                    (settling.until, settling.by_poll) = (self.now, false);
+                }
+            }
+            return;
+        };
+        while let Some(at) = self.settling.iter().position(|settling| is_read_back(settling, &self.devices)) {
+            let Settling { mut active, .. } = self.settling.remove(at);
+            let state = &self.devices[device];
+            let own = state.details(active.flow.point()).at.span;
+            let begin = usize::from(own.first() - span.first());
+            let own_words = words.get(begin..begin + own.count() as usize).unwrap_or_default().to_vec();
+            let step = active.flow.answered(state.device(), state.known(), &Ok(Answer::Words(own_words)));
+            self.take_step(active, step);
         }
     }
 
@@ -241,8 +295,19 @@ impl Bus {
 
     /// When the next command that was written can be read back.
     pub(super) fn settled_at(&self) -> Option<Time> {
-        self.settling.iter().map(|(at, _)| *at).min()
+        self.settling.iter().map(|settling| settling.until).min()
     }
+}
+
+/// A point that was written and is not yet read back is left alone until then.
+fn can_begin(devices: &[DeviceState], settling: &[Settling], now: Time, waiting: &Waiting) -> bool {
+    let device = &devices[waiting.device];
+    let is_settling = |point: &PointIndex| {
+        let same = |active: &Active| active.device == waiting.device && active.flow.point() == *point;
+        settling.iter().any(|settling| same(&settling.active))
+    };
+    device.can_take(now, waiting.target, &waiting.wanted)
+        && !device.written_by(waiting.target).iter().any(is_settling)
 }
 
 /// A thing's outcome names what was wanted of the thing, and holds what its last point answered.

@@ -15,15 +15,15 @@ use std::collections::BTreeMap;
 use crate::engine::address::Span;
 use crate::engine::codec;
 use crate::engine::command::words_of;
-use crate::engine::device::{Device, Point, PointIndex};
+use crate::engine::device::{Device, Point, PointIndex, Poll};
 use crate::engine::health::Counters;
-use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::homeassistant::{self, Outline};
 use crate::engine::identity;
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::{self, Cost, Read};
-use crate::engine::schedule::{Polls, Urgency};
+use crate::engine::schedule::{Place, Polls, Urgency};
 use crate::engine::settings::{DeviceSettings, Eeprom};
-use crate::engine::state::Values;
+use crate::engine::state::{Absorbed, Values};
 use crate::engine::time::{Duration, Time};
 use crate::engine::upkeep::Upkeep;
 use crate::engine::value::Missing;
@@ -67,7 +67,7 @@ pub(super) struct DeviceState {
     told_info: String,
     /// The last info said that the device is there.
     told_present: bool,
-    announced: Option<Announcement>,
+    announced: Option<Outline>,
     announcement_due: bool,
     /// A `get` or a command wants these told even if they have not changed.
     tell_anyway: Vec<PointIndex>,
@@ -95,6 +95,13 @@ enum Presence {
 pub(super) enum Polled {
     Identification(Call),
     Read(usize, Call),
+}
+
+/// Where a device stood before it was asked.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Turn {
+    place: Option<Place>,
+    served_at: Time,
 }
 
 impl DeviceState {
@@ -162,6 +169,14 @@ impl DeviceState {
         device.wire.watchdog.is_some() || device.points.iter().any(|point| point.heartbeat.is_some())
     }
 
+    pub(super) fn has_heartbeats(&self) -> bool {
+        self.settings.device.points.iter().any(|point| point.heartbeat.is_some())
+    }
+
+    pub(super) fn has_settings(&self) -> bool {
+        !self.settings.wanted.is_empty()
+    }
+
     pub(super) fn is_present(&self) -> bool {
         self.presence == Presence::Present
     }
@@ -200,8 +215,39 @@ impl DeviceState {
         self.settings.device.identify.as_ref().map(identity::question)
     }
 
-    pub(super) fn begin_read(&mut self, read: usize, now: Time) {
-        self.polls.begin(read, now);
+    /// Returns what its turn was before.
+    pub(super) fn begin_read(&mut self, read: usize, now: Time) -> Turn {
+        Turn { place: Some(self.polls.begin(read, now)), ..self.turn() }
+    }
+
+    pub(super) fn turn(&self) -> Turn {
+        Turn { place: None, served_at: self.served_at }
+    }
+
+    pub(super) fn span_of(&self, read: usize) -> Span {
+        self.polls.read(read).span
+    }
+
+    /// Whether one of the fast polls reads this point at its own place, and nothing waits for what it
+    /// decides.
+    pub(super) fn is_polled_fast(&self, point: PointIndex) -> bool {
+        self.details(point).poll == Poll::Fast
+            && self.is_present()
+            && !self.values.is_selector(point)
+            && self.polls.reads_at(point, self.details(point).at)
+    }
+
+    /// The point's poll comes before others, since it is a command's read-back.
+    pub(super) fn want_poll(&mut self, point: PointIndex) {
+        self.polls.want(point);
+    }
+
+    /// The read that had begun never was on the wire.
+    pub(super) fn take_back(&mut self, read: usize, before: Turn) {
+        self.served_at = before.served_at;
+        if let Some(place) = before.place {
+            self.polls.take_back(read, place);
+        }
     }
 
     /// The device is being asked: returns the time before which nothing may be sent.
@@ -350,8 +396,9 @@ impl DeviceState {
         match result {
             Ok(answer) => {
                 self.polls.end(index);
-                let read = self.polls.read(index).clone();
-                self.absorb(now, &read, &words_of(&answer), context);
+                let read = self.polls.shared_read(index);
+                let absorbed = self.values.absorb_poll(now, &self.settings.device, &read, &words_of(&answer));
+                self.learn(now, &read, absorbed, context);
             }
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
@@ -395,6 +442,11 @@ impl DeviceState {
 
     fn absorb(&mut self, now: Time, read: &Read, words: &[u16], context: &mut Context) {
         let absorbed = self.values.absorb(now, &self.settings.device, read, words);
+        self.learn(now, read, absorbed, context);
+    }
+
+    /// Tells what a read has brought, and does what follows from it.
+    fn learn(&mut self, now: Time, read: &Read, absorbed: Absorbed, context: &mut Context) {
         for point in &absorbed.dropped {
             self.polls.want(*point);
             self.tell(now, *point, context);
@@ -410,7 +462,9 @@ impl DeviceState {
             context.say(Severity::Warning, text);
         }
         for (point, _) in &read.points {
-            self.tell(now, *point, context);
+            if !self.tell_anyway.is_empty() || self.values.may_be_told(now, *point, context.republish) {
+                self.tell(now, *point, context);
+            }
         }
     }
 

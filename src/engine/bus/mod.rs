@@ -14,6 +14,7 @@ mod waiting;
 
 use std::collections::VecDeque;
 
+use crate::engine::command;
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
 use crate::engine::homeassistant::Gateway;
@@ -25,8 +26,8 @@ use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settin
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
-use commands::Active;
-use device::{DeviceState, Polled};
+use commands::{Active, Settling};
+use device::{DeviceState, Polled, Turn};
 use fetch::Fetch;
 use requests::Requests;
 use waiting::{Target, WaitingCommands};
@@ -54,6 +55,8 @@ pub enum Event {
     Retire(String),
     /// Devices come to the bus, with what is remembered of them.
     Adopt(Vec<DeviceSettings>, Memories),
+    /// The request of the last [`Action::Send`] was taken back before it was on the wire.
+    Withdrawn,
     BrokerUp,
     BrokerDown,
     /// The time of [`Bus::wake_at`] has come.
@@ -81,6 +84,8 @@ pub enum Action {
         not_before: Time,
         timeout: Duration,
     },
+    /// If the last request is not on the wire yet, take it back and say [`Event::Withdrawn`].
+    Withdraw,
     Publish(Message),
     /// Keep this for the next start.
     Store(Record),
@@ -111,7 +116,7 @@ pub struct Bus {
     /// The command that has begun.
     active: Option<Active>,
     /// Commands that were written and wait until they can be read back.
-    settling: Vec<(Time, Active)>,
+    settling: Vec<Settling>,
     /// What was read for a heartbeat, and is written before anything else is asked.
     beat: Option<(usize, PointIndex, Call)>,
     /// Points that are read only because somebody asked for them.
@@ -127,6 +132,12 @@ pub struct Bus {
     counters: Counters,
     load: Load,
     stopping: bool,
+    /// When something is to be stored next.
+    record_due_at: Option<Time>,
+    /// Whether any device has heartbeats, and settings. Most have none, and with many devices looking for
+    /// them costs more than everything else.
+    has_heartbeats: bool,
+    has_settings: bool,
     now: Time,
 }
 
@@ -170,6 +181,8 @@ struct InFlight {
     device: Option<usize>,
     purpose: Purpose,
     sent_at: Time,
+    /// What the device's turn was before, in case this is taken back.
+    before: Option<Turn>,
 }
 
 enum Purpose {
@@ -208,6 +221,9 @@ impl Bus {
             counters.persistent_writes += device.recall(memories);
             device.introduce(now, &mut context);
         }
+        let record_due_at = devices.iter().filter_map(DeviceState::record_due_at).min();
+        let has_heartbeats = devices.iter().any(DeviceState::has_heartbeats);
+        let has_settings = devices.iter().any(DeviceState::has_settings);
         Bus {
             name: bus.name.clone(),
             link: bus.link.clone(),
@@ -230,6 +246,9 @@ impl Bus {
             counters,
             load: Load::default(),
             stopping: false,
+            record_due_at,
+            has_heartbeats,
+            has_settings,
             now,
         }
     }
@@ -241,7 +260,11 @@ impl Bus {
             Event::LinkUp => self.link_up(),
             Event::LinkDown(reason) => self.link_down(reason),
             Event::Reply(reply) => self.reply(reply),
-            Event::Command(command) => self.command(command),
+            Event::Command(command) => {
+                self.command(command);
+                self.make_way();
+            }
+            Event::Withdrawn => self.withdrawn(),
             Event::Get { device, point } => self.get(&device, &point),
             Event::Request(request) => self.request(request),
             Event::Retire(device) => self.retire(&device),
@@ -271,7 +294,7 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let records = self.devices.iter().filter_map(DeviceState::record_due_at);
+        let records = self.record_due_at.into_iter();
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
             return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
         }
@@ -304,6 +327,12 @@ impl Bus {
 
     /// The bus as it is now, for `/health`, `/metrics`, `/api` and `bridge/health`.
     pub fn report(&self, now: Time) -> BusReport {
+        let devices = self.devices.iter().map(|device| device.report(now)).collect();
+        BusReport { devices, ..self.summary(now) }
+    }
+
+    /// The same without points, which are most of it.
+    pub fn summary(&self, now: Time) -> BusReport {
         let reason = match &self.link_state {
             LinkState::Up | LinkState::Renewing => None,
             LinkState::Down { reason, .. } => Some(reason.clone().unwrap_or("not yet open".into())),
@@ -318,7 +347,7 @@ impl Bus {
             paused: matches!(self.link_state, LinkState::Paused { .. }),
             counters: self.counters,
             load: self.load.share(now),
-            devices: self.devices.iter().map(|device| device.report(now)).collect(),
+            devices: self.devices.iter().map(|device| device.summary(now)).collect(),
         }
     }
 
@@ -404,7 +433,15 @@ impl Bus {
         let device = &mut self.devices[index];
         match in_flight.purpose {
             Purpose::Identify => device.identified(self.now, result, &mut self.context),
-            Purpose::Poll { read } => device.polled(self.now, read, result, &mut self.context),
+            Purpose::Poll { read } => {
+                let span = device.span_of(read);
+                let awaited = !self.settling.is_empty();
+                let words = result.as_ref().ok().filter(|_| awaited).map(command::words_of);
+                device.polled(self.now, read, result, &mut self.context);
+                if awaited {
+                    self.poll_ended(index, span, words.as_deref());
+                }
+            }
             Purpose::Command => self.command_answered(result),
             Purpose::Fetch => self.fetched(result),
             Purpose::BeatRead(point) => {
@@ -439,6 +476,23 @@ impl Bus {
     fn find(&self, device: &str, name: &str) -> Option<(usize, Target)> {
         let index = self.devices.iter().position(|state| state.name() == device)?;
         Some((index, self.devices[index].target_named(name)?))
+    }
+
+    /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn.
+    fn make_way(&mut self) {
+        let is_poll = |in_flight: &InFlight| matches!(in_flight.purpose, Purpose::Poll { .. });
+        if self.in_flight.as_ref().is_some_and(is_poll) && self.command_can_begin() {
+            self.context.actions.push_back(Action::Withdraw);
+        }
+    }
+
+    fn withdrawn(&mut self) {
+        let Some(in_flight) = self.in_flight.take() else { return };
+        if let (Purpose::Poll { read }, Some(device), Some(before)) =
+            (in_flight.purpose, in_flight.device, in_flight.before)
+        {
+            self.devices[device].take_back(read, before);
+        }
     }
 
     // What to ask next.
@@ -488,6 +542,9 @@ impl Bus {
 
     /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.
     fn begin_beat(&mut self, late: bool) -> bool {
+        if !self.has_heartbeats {
+            return false;
+        }
         let now = self.now;
         let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
         let due = devices.find_map(|(index, device)| Some((index, device.beat_due(now, late)?)));
@@ -504,30 +561,39 @@ impl Bus {
         is_to_be_fed && !device.is_leaving
     }
 
+    /// Whether any device has heartbeats or settings.
+    fn look_what_they_have(&mut self) {
+        self.has_heartbeats = self.devices.iter().any(DeviceState::has_heartbeats);
+        self.has_settings = self.devices.iter().any(DeviceState::has_settings);
+    }
+
     fn remember(&mut self) {
         for device in &mut self.devices {
             if let Some(record) = device.record(self.now, self.stopping) {
                 self.context.actions.push_back(Action::Store(record));
             }
         }
+        self.record_due_at = self.devices.iter().filter_map(DeviceState::record_due_at).min();
     }
 
     fn send(&mut self, device: usize, call: Call, purpose: Purpose) {
         let state = &mut self.devices[device];
-        if let Purpose::Poll { read } = purpose {
-            state.begin_read(read, self.now);
-        }
+        let before = match purpose {
+            Purpose::Poll { read } => state.begin_read(read, self.now),
+            _ => state.turn(),
+        };
         let timeout = state.timeout(self.response_timeout);
         let not_before = state.asked(self.now);
         let request = state.request(call);
-        self.in_flight = Some(InFlight { device: Some(device), purpose, sent_at: not_before });
+        self.in_flight =
+            Some(InFlight { device: Some(device), purpose, sent_at: not_before, before: Some(before) });
         self.context.actions.push_back(Action::Send { request, not_before, timeout });
     }
 
     /// Asks a unit that is no device of this gateway.
     fn send_stranger(&mut self, request: Request, purpose: Purpose) {
         let (now, timeout) = (self.now, self.response_timeout);
-        self.in_flight = Some(InFlight { device: None, purpose, sent_at: now });
+        self.in_flight = Some(InFlight { device: None, purpose, sent_at: now, before: None });
         self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
     }
 }

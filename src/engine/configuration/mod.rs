@@ -9,6 +9,7 @@ mod wishes;
 mod words;
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use crate::engine::address::Span;
 use crate::engine::configuration::file::Configuration;
@@ -349,8 +350,9 @@ impl Resolver<'_> {
     }
 
     fn devices(&mut self, file: &Configuration) -> Vec<DeviceSettings> {
-        let mut devices = Vec::new();
+        let mut devices: Vec<DeviceSettings> = Vec::new();
         let mut taken: Vec<(&Name, Unit, &At<Name>)> = Vec::new();
+        let mut distinct: Vec<Arc<Device>> = Vec::new();
         for (name, device) in file.devices.get().into_iter().flat_map(Map::iter) {
             self.device_name(name, file);
             if let (Some(bus), Some(unit)) = (device.bus.get(), device.unit.get()) {
@@ -381,7 +383,7 @@ impl Resolver<'_> {
                     title: device.name.clone().unwrap_or_else(|| title(&name.0)),
                     bus,
                     unit: unit.value.0,
-                    device: resolved,
+                    device: shared(resolved, &mut distinct),
                     wanted: wanted.unwrap_or_default(),
                     raw_write: raw_write.unwrap_or_default(),
                 });
@@ -517,7 +519,7 @@ impl Resolver<'_> {
     fn intervals(&mut self, file: &Intervals, device: &mut Device) {
         let intervals = &mut device.wire.intervals;
         for (wish, own) in [(&file.fast, &mut intervals.fast), (&file.slow, &mut intervals.slow)] {
-            self.within(wish.as_ref(), Duration::from_millis(10), Duration::from_secs(86_400));
+            self.within(wish.as_ref(), Duration::from_millis(1), Duration::from_secs(86_400));
             if let Some(wish) = wish {
                 *own = wish.value;
             }
@@ -534,6 +536,19 @@ impl Resolver<'_> {
             self.faults.add(&found.place, format!("{value} is out of range; expected {least} to {most}"));
         }
     }
+}
+
+/// Many devices of one profile are kept once. Of those that wish something of their own there may be as
+/// many as devices, and not all are compared.
+fn shared(device: Device, distinct: &mut Vec<Arc<Device>>) -> Arc<Device> {
+    const COMPARED_MAX: usize = 8;
+    let same_profile = distinct.iter().rev().filter(|other| other.profile == device.profile);
+    if let Some(other) = same_profile.take(COMPARED_MAX).find(|other| ***other == device) {
+        return other.clone();
+    }
+    let device = Arc::new(device);
+    distinct.push(device.clone());
+    device
 }
 
 fn read_part<T>(part: &Option<Part<T>>) -> Option<&T> {

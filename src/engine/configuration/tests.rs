@@ -45,7 +45,7 @@ fn with_wishes(wishes: &str) -> Device {
         "buses: {{plant: {{tcp: 'h:502'}}}}\n\
          devices:\n  pump:\n    profile: acme/ra2\n    bus: plant\n    unit: 0\n    points:\n{wishes}"
     );
-    good(&text).0.devices.remove(0).device
+    Device::clone(&good(&text).0.devices.remove(0).device)
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! One discovery message for each Modbus device, and the farewell to what it no longer has.
 
 use std::collections::BTreeMap;
+use std::hash::{DefaultHasher, Hash, Hasher};
 
 use serde_json::{Map, Value, json};
 
@@ -124,12 +125,46 @@ impl Announcement {
     }
 }
 
+/// What is kept of an announcement that was made: taken apart it is eight times as large as its text, and
+/// this is a tenth of it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outline {
+    fingerprint: u64,
+    /// A line for each component: its key and its platform.
+    components: String,
+}
+
+impl Outline {
+    pub fn of(announcement: &Announcement, message: &Message) -> Outline {
+        let mut hasher = DefaultHasher::new();
+        message.payload.hash(&mut hasher);
+        let mut components = String::new();
+        for (key, platform) in announcement.components() {
+            components.extend([key, " ", platform, "\n"]);
+        }
+        components.shrink_to_fit();
+        Outline { fingerprint: hasher.finish(), components }
+    }
+
+    /// As [`farewell`].
+    pub fn farewell(&self, next: &Announcement) -> Option<Message> {
+        farewell_to(self.components.lines().filter_map(|line| line.split_once(' ')), next)
+    }
+}
+
 /// What must be said before `next` when `previous` was announced: a component that is merely left
 /// out stays in Home Assistant as an orphan. `None` if nothing is dropped. Not retained, since the
 /// topic keeps what `next` says.
 pub fn farewell(previous: &Announcement, next: &Announcement) -> Option<Message> {
+    farewell_to(previous.components(), next)
+}
+
+fn farewell_to<'p>(
+    previous: impl Iterator<Item = (&'p str, &'p str)>,
+    next: &Announcement,
+) -> Option<Message> {
     let kept: BTreeMap<&str, &str> = next.components().collect();
-    let gone: Vec<(&str, &str)> = previous.components().filter(|(key, _)| !kept.contains_key(key)).collect();
+    let gone: Vec<(&str, &str)> = previous.filter(|(key, _)| !kept.contains_key(key)).collect();
     if gone.is_empty() {
         return None;
     }
@@ -262,7 +297,7 @@ mod tests {
             title: "Heating".into(),
             bus: 0,
             unit: 1,
-            device,
+            device: device.into(),
             wanted: Vec::new(),
             raw_write: Vec::new(),
         }

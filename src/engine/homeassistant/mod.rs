@@ -9,7 +9,7 @@ mod entity;
 mod gateway;
 mod thing;
 
-pub use announcement::{Announcement, Gateway, announcement, farewell};
+pub use announcement::{Announcement, Gateway, Outline, announcement, farewell};
 pub use entity::{Entity, companions, entity, is_settled, sentence};
 pub use gateway::{announce_bridge, announce_bus};
 pub use thing::name_of_thing;

@@ -15,6 +15,9 @@ const FRAME: Duration = Duration::from_millis(7);
 const PROBE_SHORTEST: Duration = Duration::from_millis(50);
 /// So many times its slowest answer, and a device that is there has answered.
 const PROBE_FACTOR: u32 = 3;
+/// One slow answer among many shall not make every later probe slow: with each answer the slowest loses
+/// this part.
+const FADING: u32 = 64;
 /// From so many failures on, and then each time that they have doubled, a probe waits as long as any
 /// request: a device may come back slower than it went, but such waits must not add up.
 const FULL_PROBE_FROM: u32 = 8;
@@ -26,7 +29,7 @@ const JITTER_PERCENT: u32 = 6;
 pub(super) struct Patience {
     /// Requests without an answer since the last answer.
     failures: u32,
-    /// From sending a request to its answer's first byte.
+    /// From sending a request to its answer's first byte; old ones fade.
     slowest_answer: Option<Duration>,
 }
 
@@ -37,7 +40,8 @@ impl Patience {
 
     pub(super) fn answered(&mut self, latency: Option<Duration>) {
         self.failures = 0;
-        self.slowest_answer = self.slowest_answer.max(latency);
+        let faded = self.slowest_answer.map(|slowest| slowest * (FADING - 1) / FADING);
+        self.slowest_answer = faded.max(latency);
     }
 
     pub(super) fn unanswered(&mut self) {
@@ -128,6 +132,14 @@ mod tests {
             assert!(share < if known == Some(9) { 0.032 } else { 0.037 }, "{known:?}: {share}");
             assert!(longest <= Duration::from_millis(return_within), "{known:?}: {longest:?}");
         }
+    }
+
+    #[test]
+    fn one_slow_answer_is_forgotten_after_many_quick_ones() {
+        let mut patience = silent(0, Some(400));
+        (0..300).for_each(|_| patience.answered(Some(Duration::from_millis(12))));
+        (0..3).for_each(|_| patience.unanswered());
+        assert_eq!(patience.timeout(FULL, None), Duration::from_millis(50));
     }
 
     #[test]

@@ -13,12 +13,22 @@ use super::{DeviceState, Presence};
 impl DeviceState {
     pub(in crate::engine::bus) fn report(&self, now: Time) -> DeviceReport {
         let device = &self.settings.device;
-        let online = self.told_available == Some(true);
-        // It answers, but nothing is told before everything has been read once.
-        let begins = (!online && self.presence == Presence::Present).then(|| "being read".to_string());
         let points = device.points.iter().enumerate().filter(|(_, point)| !point.is_button());
         // A button has no state.
         let things = device.things.iter().filter(|thing| thing.kind != ThingKind::Button);
+        DeviceReport {
+            points: points.map(|(index, point)| self.report_point(index, point)).collect(),
+            things: things.map(|thing| self.report_thing(thing)).collect(),
+            ..self.summary(now)
+        }
+    }
+
+    /// Without points and things, which are most of it.
+    pub(in crate::engine::bus) fn summary(&self, now: Time) -> DeviceReport {
+        let device = &self.settings.device;
+        let online = self.told_available == Some(true);
+        // It answers, but nothing is told before everything has been read once.
+        let begins = (!online && self.presence == Presence::Present).then(|| "being read".to_string());
         DeviceReport {
             name: self.settings.name.clone(),
             title: self.settings.title.clone(),
@@ -32,8 +42,8 @@ impl DeviceState {
             counters: self.counters,
             last_answer_at: self.last_answer_at,
             periods: self.report_periods(now),
-            points: points.map(|(index, point)| self.report_point(index, point)).collect(),
-            things: things.map(|thing| self.report_thing(thing)).collect(),
+            points: Vec::new(),
+            things: Vec::new(),
             drift: self.upkeep.drift(),
         }
     }

@@ -244,8 +244,8 @@ impl DeviceState {
                 self.tell(now, *point, context);
             }
         }
-        if let Some(announced) = &self.announced {
-            context.publish(announced.message());
+        if self.announced.is_some() {
+            context.publish(self.announcement(context).message());
         }
         wanted
     }

@@ -6,7 +6,7 @@ use serde_json::json;
 use crate::engine::codec;
 use crate::engine::device::{PointIndex, Thing};
 use crate::engine::health::drift_json;
-use crate::engine::homeassistant;
+use crate::engine::homeassistant::{self, Announcement, Outline};
 use crate::engine::time::Time;
 use crate::engine::topics::{Message, OFFLINE, ONLINE};
 use crate::engine::value::{Missing, Reading};
@@ -99,25 +99,25 @@ impl DeviceState {
         if !context.discovery {
             return;
         }
-        let next = homeassistant::announcement(
-            &context.gateway,
-            &self.settings,
-            &context.bus_name,
-            self.values.known(),
-        );
+        let next = self.announcement(context);
         if next.is_empty() && self.announced.is_none() {
             return;
         }
-        if self.announced.as_ref() == Some(&next) {
+        let message = next.message();
+        let outline = Outline::of(&next, &message);
+        if self.announced.as_ref() == Some(&outline) {
             return;
         }
-        if let Some(previous) = self.announced.take() {
-            if let Some(farewell) = homeassistant::farewell(&previous, &next) {
-                context.publish(farewell);
-            }
+        let previous = self.announced.replace(outline);
+        if let Some(farewell) = previous.and_then(|previous| previous.farewell(&next)) {
+            context.publish(farewell);
         }
-        context.publish(next.message());
-        self.announced = Some(next);
+        context.publish(message);
+    }
+
+    /// What Home Assistant is to know of the device now.
+    pub(super) fn announcement(&self, context: &Context) -> Announcement {
+        homeassistant::announcement(&context.gateway, &self.settings, &context.bus_name, self.values.known())
     }
 
     pub(super) fn tell_info(&mut self, context: &mut Context) {

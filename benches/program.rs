@@ -1,0 +1,135 @@
+//! The programs of a measurement: a real mosquitto, and the release build of busker.
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader};
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use anyhow::{Context, bail};
+use tempfile::TempDir;
+
+use crate::clock::{now, seconds_since};
+use crate::machine;
+
+pub struct Mosquitto {
+    child: Child,
+    pub port: u16,
+    _folder: TempDir,
+}
+
+impl Mosquitto {
+    pub fn start() -> anyhow::Result<Mosquitto> {
+        let folder = tempfile::tempdir()?;
+        for _ in 0..5 {
+            let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
+            let path = folder.path().join("mosquitto.conf");
+            // Its own defaults hold back what a subscriber has not taken yet, and then drop it.
+            let text = format!(
+                "listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nlog_dest stderr\n\
+                 set_tcp_nodelay true\nmax_queued_messages 0\nmax_inflight_messages 0\n"
+            );
+            fs::write(&path, text)?;
+            let mut child = Command::new("mosquitto")
+                .arg("-c")
+                .arg(&path)
+                .stdout(Stdio::null())
+                .stderr(Stdio::piped())
+                .spawn()
+                .context("mosquitto cannot be started; `scripts/get-mosquitto` gets it")?;
+            let log = child.stderr.take().context("its log is piped")?;
+            let mut lines = BufReader::new(log).lines().map_while(Result::ok);
+            // Without the port it ends, and so does its log.
+            if lines.any(|line| line.ends_with(" running")) {
+                std::thread::spawn(move || lines.for_each(drop));
+                return Ok(Mosquitto { child, port, _folder: folder });
+            }
+            let _ = child.wait();
+        }
+        bail!("mosquitto does not start")
+    }
+
+    pub fn cpu_seconds(&self) -> f64 {
+        machine::cpu_seconds(self.child.id())
+    }
+}
+
+impl Drop for Mosquitto {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A running gateway.
+pub struct Busker {
+    child: Child,
+    pub started_at: i64,
+    folder: TempDir,
+}
+
+impl Busker {
+    /// `busker run` with this broker and with buses and devices as in `rest`.
+    pub fn start(mosquitto: &Mosquitto, rest: &str) -> anyhow::Result<Busker> {
+        let folder = tempfile::tempdir()?;
+        let text = format!(
+            "mqtt: {{url: \"mqtt://127.0.0.1:{}\"}}\nhttp: {{listen: \"127.0.0.1:0\"}}\nstate_dir: {}\n{rest}",
+            mosquitto.port,
+            folder.path().display(),
+        );
+        let path = folder.path().join("busker.yaml");
+        fs::write(&path, text)?;
+        let log = File::create(folder.path().join("log"))?;
+        let started_at = now();
+        let child = Command::new(program()?)
+            .args(["run", "--config"])
+            .arg(&path)
+            .env_remove("RUST_LOG")
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()?;
+        Ok(Busker { child, started_at, folder })
+    }
+
+    pub fn cpu_seconds(&self) -> f64 {
+        machine::cpu_seconds(self.child.id())
+    }
+
+    /// In bytes.
+    pub fn resident(&self) -> f64 {
+        machine::resident(self.child.id())
+    }
+
+    /// Looks until `done`; fails with what the program said when that takes too long.
+    pub fn wait(&mut self, seconds: f64, what: &str, mut done: impl FnMut() -> bool) -> anyhow::Result<()> {
+        let began_at = now();
+        while !done() {
+            let ended = self.child.try_wait()?.is_some();
+            if ended || seconds_since(began_at) > seconds {
+                let log = fs::read_to_string(self.folder.path().join("log")).unwrap_or_default();
+                bail!("waited in vain for {what}; the program said:\n{log}");
+            }
+            crate::clock::sleep(std::time::Duration::from_millis(2));
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Busker {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The release build, which lies beside the folder of this one.
+pub fn program() -> anyhow::Result<PathBuf> {
+    let own = std::env::current_exe()?;
+    let folder = own.parent().and_then(Path::parent).context("the benchmark is in a folder")?;
+    let program = folder.join("busker");
+    if !program.exists() {
+        bail!("`{}` is not there; `make bench` builds it", program.display());
+    }
+    Ok(program)
+}

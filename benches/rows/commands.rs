@@ -1,0 +1,145 @@
+//! W4 and W5: the way between MQTT and the wire, in both directions.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use super::saturated::cycles;
+use super::{AT_ONCE, Bench, Configured, REGISTERS, Rig, UNITS, W1_LINE, W1_TURNAROUND, points};
+use crate::clock::{now, sleep};
+use crate::machine::Watch;
+use crate::report::{Figure, Target, greatest, median, quantile};
+use crate::wire::Behaviour;
+
+const W1: Behaviour =
+    Behaviour { line: W1_LINE, turnaround: W1_TURNAROUND, strict: false, counting: false, first_piece: None };
+
+pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
+    let units: Vec<u8> = (1..=UNITS).collect();
+    let points = points(true).0.replacen("poll: fast", "poll: fast, write: 0..65535", 1);
+    let mut rig = Rig::start(W1, &Configured { units: &units, points: &points, period: AT_ONCE }, &[])?;
+    rig.wire.take();
+    rig.observer.take();
+    let watch = Watch::start(rig.own())?;
+    let began_at = now();
+    let time = bench.seconds(60, 15).as_nanos() as i64;
+    let mut sent: BTreeMap<u16, i64> = BTreeMap::new();
+    let mut random = Random(20_250_101);
+    while now() - began_at < time {
+        sleep(Duration::from_micros(random.between(200_000, 500_000)));
+        let value = 2000 + sent.len() as u16;
+        let unit = sent.len() % units.len() + 1;
+        let at = rig.observer.publish(&format!("busker/unit_{unit}/p0/set"), &value.to_string())?;
+        sent.insert(value, at);
+    }
+    // The last ones may still be on their way.
+    sleep(Duration::from_secs(1));
+    let transactions = rig.wire.take();
+    let noise = watch.end(rig.own());
+
+    let writes: Vec<_> = transactions.iter().filter(|seen| matches!(seen.function, 6 | 16)).collect();
+    let mut latencies = Vec::new();
+    let mut lost = 0;
+    for (value, sent_at) in &sent {
+        let mut matching = writes.iter().filter(|seen| seen.argument == *value);
+        match matching.next() {
+            Some(seen) => latencies.push((seen.heard_at - sent_at) as f64 / 1e6),
+            None => lost += 1,
+        }
+        // A command that is written twice is as bad as none.
+        lost += matching.count();
+    }
+    let outcomes = rig.observer.take();
+    let done = outcomes
+        .iter()
+        .filter(|message| message.topic.ends_with("/outcome") && message.payload.contains("\"done\""))
+        .count();
+    let silence = W1_LINE.silence();
+    let violations =
+        transactions.iter().filter_map(|seen| seen.silence).filter(|found| *found < silence).count() as u64;
+    let collisions = (violations + rig.wire.collisions() + rig.wire.damaged()) as f64;
+
+    // What is left to the polls when each command takes its write, and nothing else.
+    let cycles: Vec<f64> = cycles(&transactions).iter().map(|cycle| *cycle as f64).collect();
+    let mean = cycles.iter().sum::<f64>() / cycles.len() as f64;
+    let elapsed = cycles.iter().sum::<f64>();
+    let of_writes = writes.len() as f64 * W1_LINE.write(W1_TURNAROUND) as f64;
+    let minimum = (W1_LINE.read(REGISTERS, W1_TURNAROUND) * i64::from(UNITS)) as f64;
+    let ratio = mean / (minimum * elapsed / (elapsed - of_writes));
+    let extra = transactions
+        .iter()
+        .filter(|seen| seen.function == 3 && usize::from(seen.argument) != REGISTERS)
+        .count();
+
+    let count = sent.len();
+    let late = quantile(&latencies, 0.95).unwrap_or(f64::INFINITY);
+    let figures = [
+        Figure::new("W4", "command to its first byte, p50", Target::AtMost(19.0), " ms")
+            .reached(median(&latencies))
+            .remark(format!("{count} commands")),
+        Figure::new("W4", "command to its first byte, p95", Target::AtMost(36.0), " ms")
+            .reached([late])
+            .remark(format!("the latest {:.1} ms", greatest(&latencies).unwrap_or_default())),
+        Figure::new("W4", "commands lost or written twice", Target::AtMost(0.0), "")
+            .reached([lost as f64])
+            .remark(format!("{done} of {count} outcomes say `done`")),
+        Figure::new("W4", "collisions, requests without their silence", Target::AtMost(0.0), "")
+            .reached([collisions]),
+        Figure::new("W4", "cycle ÷ what the commands leave", Target::AtMost(1.02), "")
+            .reached([ratio])
+            .remark(format!("{extra} reads beside the polls")),
+    ];
+    bench.tell(noise, figures);
+    Ok(())
+}
+
+pub fn w5(bench: &mut Bench) -> anyhow::Result<()> {
+    let units: Vec<u8> = (1..=UNITS).collect();
+    let points = points(true).0;
+    let mut halves = Vec::new();
+    let mut tenths = Vec::new();
+    let mut count = 0;
+    let mut missing = 0;
+    let mut noise = crate::machine::Noise::default();
+    for _ in 0..bench.runs() {
+        let configured = Configured { units: &units, points: &points, period: AT_ONCE };
+        let rig = Rig::start(Behaviour { counting: true, ..W1 }, &configured, &[])?;
+        let (transactions, of_run) = rig.measure(bench.seconds(6, 4))?;
+        sleep(Duration::from_millis(200));
+        let heard: BTreeMap<(String, String), i64> = rig
+            .observer
+            .take()
+            .into_iter()
+            .map(|message| ((message.topic, message.payload), message.at))
+            .collect();
+        let mut latencies = Vec::new();
+        for seen in &transactions {
+            let (Some(told), Some(ended_at)) = (seen.told, seen.ended_at) else { continue };
+            match heard.get(&(format!("busker/unit_{}/p0", seen.unit), told.to_string())) {
+                Some(at) => latencies.push((at - ended_at) as f64 / 1e6),
+                None => missing += 1,
+            }
+        }
+        count += latencies.len();
+        halves.extend(median(&latencies));
+        tenths.extend(quantile(&latencies, 0.9));
+        noise = noise.worse(of_run);
+    }
+    let figures = [
+        Figure::new("W5", "last byte to message, p50", Target::AtMost(0.6), " ms")
+            .reached(halves)
+            .remark(format!("{count} messages, {missing} missing")),
+        Figure::new("W5", "last byte to message, p90", Target::None, " ms").reached(tenths),
+    ];
+    bench.tell(noise, figures);
+    Ok(())
+}
+
+/// Moments that keep no step with the polls, and are the same in each run.
+struct Random(u64);
+
+impl Random {
+    fn between(&mut self, least: u64, most: u64) -> u64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        least + (self.0 >> 33) % (most - least)
+    }
+}
