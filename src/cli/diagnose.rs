@@ -4,6 +4,7 @@ use serde_json::{Map, Value, json};
 
 use super::by_hand::{Asked, ByHand};
 use super::{Failure, output};
+use crate::engine::modbus::names::{COUNTERS, QUERY, hexadecimal, object_name};
 use crate::engine::modbus::{Answer, Call, RequestError};
 
 /// Ask a device who it is and how it hears the line
@@ -20,21 +21,6 @@ pub struct Args {
     #[arg(long)]
     json: bool,
 }
-
-/// The counters of function 8, by sub-function (Modbus application protocol V1.1b3, 6.8.1).
-const COUNTERS: [(u16, &str); 8] = [
-    (11, "bus_messages"),
-    (12, "bus_checksum_errors"),
-    (13, "bus_exceptions"),
-    (14, "unit_messages"),
-    (15, "unit_no_responses"),
-    (16, "unit_negative_acknowledges"),
-    (17, "unit_busy"),
-    (18, "bus_overruns"),
-];
-
-/// What the query holds that must come back.
-const QUERY: u16 = 0xA537;
 
 /// A line of the result: what was asked, and the device's word or why there is none.
 type Finding = (String, Result<Value, RequestError>);
@@ -83,21 +69,10 @@ fn identification(device: &mut Asked) -> Result<Vec<Finding>, Failure> {
     }
 }
 
-fn object_name(number: u8) -> String {
-    match number {
-        0 => "vendor".into(),
-        1 => "product".into(),
-        2 => "revision".into(),
-        number => format!("object_{number}"),
-    }
-}
-
 fn told(answer: &Answer) -> Value {
     match answer {
         Answer::Diagnostics(words) => words.first().copied().into(),
-        Answer::ServerId(bytes) => {
-            bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(" ").into()
-        }
+        Answer::ServerId(bytes) => hexadecimal(bytes).into(),
         _ => Value::Null,
     }
 }

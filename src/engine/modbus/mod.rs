@@ -5,6 +5,7 @@
 //! for Modbus TCP, and `guard` the one door to both.
 
 pub mod crc;
+pub mod names;
 pub mod pdu;
 pub mod rtu_bytes;
 

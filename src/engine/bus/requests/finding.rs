@@ -5,29 +5,11 @@ use serde_json::{Map, Value as Json, json};
 use crate::engine::bus::device::DeviceState;
 use crate::engine::device::Identify;
 use crate::engine::identity;
+use crate::engine::modbus::names::{COUNTERS, QUERY, hexadecimal, object_name};
 use crate::engine::modbus::{self, Answer, Call, RequestError};
 use crate::engine::request::Status;
 
 use super::Progress;
-
-/// The names of the objects of function 43/14 (Modbus application protocol V1.1b3, 6.21).
-const OBJECTS: [&str; 7] =
-    ["vendor", "product", "revision", "vendor_url", "product_name", "model_name", "application"];
-
-/// The counters of function 8, by sub-function (Modbus application protocol V1.1b3, 6.8.1).
-const COUNTERS: [(u16, &str); 8] = [
-    (11, "bus_messages"),
-    (12, "bus_checksum_errors"),
-    (13, "bus_exceptions"),
-    (14, "unit_messages"),
-    (15, "unit_no_responses"),
-    (16, "unit_negative_acknowledges"),
-    (17, "unit_busy"),
-    (18, "bus_overruns"),
-];
-
-/// What the query holds that must come back.
-const QUERY: u16 = 0xA537;
 
 /// All objects of function 43/14, the server id of function 17, and what the profile goes by.
 pub(super) struct Identification {
@@ -165,14 +147,6 @@ impl Identification {
         let error = error.unwrap_or_else(|| RequestError::Timeout.to_string());
         Progress::Done { status: Status::Error, data, error: Some(error) }
     }
-}
-
-fn object_name(number: u8) -> String {
-    OBJECTS.get(usize::from(number)).map_or_else(|| format!("object_{number}"), |name| name.to_string())
-}
-
-fn hexadecimal(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(" ")
 }
 
 /// Function 8: the echo of a query, then the device's counters; and what busker itself has counted.
