@@ -45,6 +45,13 @@ pub struct Place {
     wanted_now: bool,
 }
 
+impl Place {
+    /// It was wanted at once, and not because its period was over.
+    pub fn was_wanted(&self) -> bool {
+        self.wanted_now
+    }
+}
+
 /// How much a read is wanted; the greatest is next.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub enum Urgency {
@@ -95,6 +102,14 @@ impl Polls {
             }
         }
         best
+    }
+
+    /// The read that has waited longest among those that may begin now, whether it is wanted at once or
+    /// not, and for how many of its periods.
+    pub fn longest_waiting(&self, now: Time) -> Option<(usize, f64)> {
+        let waiting = self.reads.iter().enumerate();
+        let waiting = waiting.filter_map(|(index, planned)| Some((index, planned.waited(now)?)));
+        waiting.reduce(|best, other| if other.1 > best.1 { other } else { best })
     }
 
     /// Whether a read that is sent now and then takes `point` from this place.
@@ -231,6 +246,17 @@ impl Planned {
         let (period, began_at) = (self.period?, self.began_at?);
         let waited = now - began_at;
         (waited >= period).then(|| Urgency::Overdue(waited.as_secs_f64() / period.as_secs_f64().max(1e-6)))
+    }
+
+    /// For how many of its periods it has waited. What has no period and is wanted counts in tens of seconds,
+    /// and comes first when it has never been read.
+    fn waited(&self, now: Time) -> Option<f64> {
+        const NO_PERIOD: Duration = Duration::from_secs(10);
+        self.urgency(now)?;
+        let Some(began_at) = self.began_at else { return Some(f64::INFINITY) };
+        let period = self.period.unwrap_or(NO_PERIOD).as_secs_f64().max(1e-6);
+        let waited = (now - began_at).as_secs_f64() / period;
+        (waited >= 1.0).then_some(waited)
     }
 
     fn due_at(&self) -> Option<Time> {

@@ -4,6 +4,7 @@
 //! whole transcript anew; it must equal the file. `BLESS=1` rewrites the files; read the diff.
 
 mod devices;
+mod fairness;
 mod play;
 mod properties;
 

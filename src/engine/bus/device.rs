@@ -104,6 +104,13 @@ pub(super) struct Turn {
     served_at: Time,
 }
 
+impl Turn {
+    /// It was asked out of turn.
+    pub(super) fn was_wanted(&self) -> bool {
+        self.place.is_some_and(|place| place.was_wanted())
+    }
+}
+
 impl DeviceState {
     pub(super) fn new(settings: DeviceSettings, cost: Cost, eeprom: Eeprom) -> DeviceState {
         let values = Values::new(&settings.device);
@@ -209,6 +216,20 @@ impl DeviceState {
         }
         let (index, urgency) = self.polls.most_urgent(now)?;
         Some((Polled::Read(index, Call::Read(self.polls.read(index).span)), urgency))
+    }
+
+    /// What has waited longest, wanted at once or not, and for how many of its periods.
+    pub(super) fn longest_waiting(&self, now: Time) -> Option<(Polled, f64)> {
+        if now < self.paused_until {
+            return None;
+        }
+        if self.presence != Presence::Present {
+            if let Some(call) = self.identification_call() {
+                return Some((Polled::Identification(call), f64::INFINITY));
+            }
+        }
+        let (index, waited) = self.polls.longest_waiting(now)?;
+        Some((Polled::Read(index, Call::Read(self.polls.read(index).span)), waited))
     }
 
     fn identification_call(&self) -> Option<Call> {

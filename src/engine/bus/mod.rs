@@ -2,7 +2,9 @@
 //!
 //! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
 //! `ask_next` chooses the next: the command that has begun, heartbeats that are late, waiting commands,
-//! heartbeats, what somebody asked for, settings that are not as they are wanted, a scan, then whichever device's read (or identification) is most urgent.
+//! heartbeats, what somebody asked for, settings that are not as they are wanted, a scan, then whichever
+//! device's read (or identification) is most urgent. Whoever asks without end still does not keep a read that
+//! is due from the wire: [`AHEAD_OF_READS`].
 
 mod change;
 mod commands;
@@ -34,6 +36,9 @@ use waiting::{Target, WaitingCommands};
 
 /// After so many requests in a row that nobody answers, a TCP connection is made anew.
 const UNANSWERED_UNTIL_RENEWED: u32 = 5;
+/// So many requests in a row may go before a read that is due, because somebody wants them at once. Then
+/// the read has its turn: under a flood of commands every period stretches, but nothing starves.
+const AHEAD_OF_READS: u32 = 8;
 
 /// What can happen to a bus.
 #[derive(Clone, Debug, PartialEq)]
@@ -125,6 +130,8 @@ pub struct Bus {
     /// A setting has just been written: what is due to be read comes before the next one.
     wrote_setting: bool,
     in_flight: Option<InFlight>,
+    /// Requests in a row that were wanted at once.
+    ahead: u32,
     link_state: LinkState,
     /// Requests in a row that no device on this link answered.
     unanswered: u32,
@@ -183,6 +190,8 @@ struct InFlight {
     sent_at: Time,
     /// What the device's turn was before, in case this is taken back.
     before: Option<Turn>,
+    /// A command may take its turn.
+    gives_way: bool,
 }
 
 enum Purpose {
@@ -240,6 +249,7 @@ impl Bus {
             requests: Requests::default(),
             wrote_setting: false,
             in_flight: None,
+            ahead: 0,
             link_state: LinkState::Down { reason: None, attempts: 0 },
             unanswered: 0,
             broker_up: true,
@@ -480,8 +490,8 @@ impl Bus {
 
     /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn.
     fn make_way(&mut self) {
-        let is_poll = |in_flight: &InFlight| matches!(in_flight.purpose, Purpose::Poll { .. });
-        if self.in_flight.as_ref().is_some_and(is_poll) && self.command_can_begin() {
+        let gives_way = |in_flight: &InFlight| in_flight.gives_way;
+        if self.in_flight.as_ref().is_some_and(gives_way) && self.command_can_begin() {
             self.context.actions.push_back(Action::Withdraw);
         }
     }
@@ -504,6 +514,7 @@ impl Bus {
                 continue;
             }
             if self.begin_beat(true)
+                || self.begin_overdue_read()
                 || self.begin_command()
                 || self.begin_beat(false)
                 || self.next_fetch()
@@ -532,12 +543,36 @@ impl Bus {
                 }
                 return;
             };
-            let (call, purpose) = match polled {
-                Polled::Identification(call) => (call, Purpose::Identify),
-                Polled::Read(read, call) => (call, Purpose::Poll { read }),
-            };
-            self.send(device, call, purpose);
+            self.poll(device, polled);
         }
+    }
+
+    fn poll(&mut self, device: usize, polled: Polled) {
+        let (call, purpose) = match polled {
+            Polled::Identification(call) => (call, Purpose::Identify),
+            Polled::Read(read, call) => (call, Purpose::Poll { read }),
+        };
+        self.send(device, call, purpose);
+    }
+
+    /// A read that is due, after [`AHEAD_OF_READS`] requests that went before it.
+    fn begin_overdue_read(&mut self) -> bool {
+        if self.ahead < AHEAD_OF_READS {
+            return false;
+        }
+        self.ahead = 0;
+        let now = self.now;
+        let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+        let overdue = candidates.filter_map(|(index, device)| {
+            let (polled, waited) = device.longest_waiting(now)?;
+            Some((index, polled, waited))
+        });
+        let longest = overdue.reduce(|best, other| if other.2 > best.2 { other } else { best });
+        let Some((device, polled, _)) = longest else { return false };
+        self.poll(device, polled);
+        self.ahead = 0;
+        self.in_flight.iter_mut().for_each(|in_flight| in_flight.gives_way = false);
+        true
     }
 
     /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.
@@ -582,18 +617,31 @@ impl Bus {
             Purpose::Poll { read } => state.begin_read(read, self.now),
             _ => state.turn(),
         };
+        let gives_way = matches!(purpose, Purpose::Poll { .. });
+        match purpose {
+            Purpose::Command | Purpose::Fetch => self.ahead += 1,
+            Purpose::Poll { .. } if before.was_wanted() => self.ahead += 1,
+            Purpose::Poll { .. } => self.ahead = 0,
+            _ => {}
+        }
         let timeout = state.timeout(self.response_timeout);
         let not_before = state.asked(self.now);
         let request = state.request(call);
-        self.in_flight =
-            Some(InFlight { device: Some(device), purpose, sent_at: not_before, before: Some(before) });
+        self.in_flight = Some(InFlight {
+            device: Some(device),
+            purpose,
+            sent_at: not_before,
+            before: Some(before),
+            gives_way,
+        });
         self.context.actions.push_back(Action::Send { request, not_before, timeout });
     }
 
     /// Asks a unit that is no device of this gateway.
     fn send_stranger(&mut self, request: Request, purpose: Purpose) {
         let (now, timeout) = (self.now, self.response_timeout);
-        self.in_flight = Some(InFlight { device: None, purpose, sent_at: now, before: None });
+        self.in_flight =
+            Some(InFlight { device: None, purpose, sent_at: now, before: None, gives_way: false });
         self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
     }
 }
