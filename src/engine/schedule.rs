@@ -112,6 +112,15 @@ impl Polls {
         waiting.reduce(|best, other| if other.1 > best.1 { other } else { best })
     }
 
+    /// The read that began longest ago, due or not. Only if there is no other one that the device refuses,
+    /// or that clears what it reads.
+    pub fn oldest(&self, now: Time) -> Option<usize> {
+        let awake = self.reads.iter().enumerate().filter(|(_, planned)| !planned.sleeps);
+        let oldest = awake
+            .min_by_key(|(_, planned)| (planned.read.alone, now < planned.paused_until, planned.began_at));
+        oldest.map(|(index, _)| index)
+    }
+
     /// Whether a read that is sent now and then takes `point` from this place.
     pub fn reads_at(&self, point: PointIndex, place: Address) -> bool {
         let holds = |planned: &Planned| planned.read.points.contains(&(point, place)) && !planned.sleeps;

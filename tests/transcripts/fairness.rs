@@ -1,49 +1,76 @@
-//! Whoever asks without end stretches what is polled, but never keeps it from the wire.
+//! Whoever asks without end stretches what is polled, but never keeps it from the wire; and what a
+//! watchdog needs comes in time.
 
-use busker::engine::address::Table;
+use std::collections::BTreeMap;
+
 use busker::engine::bus::{Action, Bus, Command, Event};
 use busker::engine::memory::Memories;
-use busker::engine::modbus::{Answer, Call, Discarded, Reply};
+use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request};
 use busker::engine::time::{Duration, Time};
 
 use crate::devices;
 
+/// Unit 9 is polled each second and nobody asks for it; unit 20 wants to hear something every 0.6 s.
+const DEVICES: &str = "device board_1 1 clamping\ndevice board_2 2 clamping\ndevice heating 3 thermometer\n\
+    device garden 9 thermometer\ndevice relays 20 relays\n";
+const WATCHDOG: Duration = Duration::from_millis(600);
 /// How long a request and its answer take.
 const TRANSACTION: Duration = Duration::from_millis(20);
-const MINUTE: Time = Time(60_000_000);
+const MINUTE: Time = Time::from_millis(60_000);
+
+/// What somebody does at each moment.
+type Flood = fn(&mut Bus, Time);
 
 #[test]
-fn a_flood_of_commands_lets_polls_through() {
-    check(|bus, now| {
-        // A script that moves four sliders and never stops.
-        let step = (now.0 / 20_000 % 2) as usize;
-        for device in ["board_1", "board_2"] {
-            for (point, values) in [("order", ["OFF", "ON"]), ("level", ["10", "20"])] {
-                let (device, point, payload) = (device.into(), point.into(), values[step].into());
-                bus.handle(now, Event::Command(Command { device, point, payload, retained: false }));
-            }
-        }
-    });
+fn a_flood_lets_polls_through() {
+    for flood in [move_sliders, get] {
+        let asked = play(flood);
+        let polls: Vec<Time> =
+            asked.iter().filter(|(_, unit, first)| (*unit, *first) == (9, 0)).map(|asked| asked.0).collect();
+        assert!(polls.len() >= 30, "{} polls in a minute", polls.len());
+        assert!(longest(&polls) < Duration::from_secs(2), "{:?} without a poll", longest(&polls));
+    }
 }
 
 #[test]
-fn a_flood_of_gets_lets_polls_through() {
-    check(|bus, now| {
-        for point in ["temperature", "strokes"] {
-            bus.handle(now, Event::Get { device: "heating".into(), point: point.into() });
-        }
-    });
+fn a_watchdog_is_fed_in_time() {
+    for flood in [move_sliders as Flood, get, nothing] {
+        let asked = play(flood).into_iter().filter(|asked| asked.1 == 20);
+        // Its time is known once it has been read.
+        let requests: Vec<Time> = asked.skip_while(|asked| asked.2 != 66).map(|asked| asked.0).collect();
+        assert!(longest(&requests) < WATCHDOG - TRANSACTION, "{:?} without a request", longest(&requests));
+    }
 }
 
-/// Plays a minute in which somebody asks at each moment, and looks how often unit 9 was polled, which
-/// nobody asks for: it wants to be polled 60 times.
-fn check(ask: impl Fn(&mut Bus, Time)) {
-    let header = "device board_1 1 clamping\ndevice board_2 2 clamping\ndevice heating 3 thermometer\n\
-        device garden 9 thermometer\n";
-    let mut bus = Bus::new(Time::default(), &devices::settings(header), 0, &Memories::default());
+/// A script that moves four sliders and never stops.
+fn move_sliders(bus: &mut Bus, now: Time) {
+    let step = (now.0 / 20_000 % 2) as usize;
+    for device in ["board_1", "board_2"] {
+        for (point, values) in [("order", ["OFF", "ON"]), ("level", ["10", "20"])] {
+            let (device, point, payload) = (device.into(), point.into(), values[step].into());
+            bus.handle(now, Event::Command(Command { device, point, payload, retained: false }));
+        }
+    }
+}
+
+fn get(bus: &mut Bus, now: Time) {
+    for point in ["temperature", "strokes"] {
+        bus.handle(now, Event::Get { device: "heating".into(), point: point.into() });
+    }
+}
+
+fn nothing(_: &mut Bus, _: Time) {}
+
+fn longest(times: &[Time]) -> Duration {
+    times.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(Duration::MAX)
+}
+
+/// Plays a minute; returns when which unit was asked, and for which register first.
+fn play(flood: Flood) -> Vec<(Time, u8, u16)> {
+    let mut bus = Bus::new(Time::default(), &devices::settings(DEVICES), 0, &Memories::default());
+    let mut registers = BTreeMap::from([((20, 66), 60)]);
+    let mut asked = Vec::new();
     let mut now = Time::default();
-    let mut held = std::collections::BTreeMap::new();
-    let (mut polls, mut last, mut longest) = (0, now, Duration::ZERO);
     bus.handle(now, Event::LinkUp);
     while now < MINUTE {
         let actions: Vec<Action> = std::iter::from_fn(|| bus.next_action()).collect();
@@ -51,36 +78,35 @@ fn check(ask: impl Fn(&mut Bus, Time)) {
             Action::Send { request, .. } => Some(request),
             _ => None,
         });
+        let sent_at = now;
+        now += TRANSACTION;
+        // Just before the answer is the worst time.
+        flood(&mut bus, now);
         let Some(request) = sent else {
-            now += TRANSACTION;
-            ask(&mut bus, now);
+            bus.handle(now, Event::Wake);
             continue;
         };
-        if request.unit == 9
-            && matches!(request.call, Call::Read(span) if span.table() == Table::Input && span.first() == 0)
-        {
-            polls += 1;
-            longest = longest.max(now - last);
-            last = now;
+        if let Call::Read(span) = request.call {
+            asked.push((sent_at, request.unit, span.first()));
         }
-        let sent_at = now;
-        // Just before the answer is the worst time.
-        now += TRANSACTION;
-        ask(&mut bus, now);
-        let answer = match request.call {
-            Call::Read(span) => {
-                let words = span.first()..=span.last();
-                Answer::Words(words.map(|at| held.get(&(request.unit, at)).copied().unwrap_or(0)).collect())
-            }
-            Call::WriteRegister { address, word } => {
-                held.insert((request.unit, address), word);
-                Answer::Written
-            }
-            _ => Answer::Written,
-        };
+        let answer = answer(&mut registers, &request);
         let reply = Reply::new(Ok(answer), sent_at, Some((now, now)), &mut Discarded::default());
         bus.handle(now, Event::Reply(reply));
     }
-    assert!(polls >= 30, "{polls} polls in a minute");
-    assert!(longest < Duration::from_secs(2), "{longest:?} without a poll");
+    asked
+}
+
+fn answer(registers: &mut BTreeMap<(u8, u16), u16>, request: &Request) -> Answer {
+    match request.call {
+        Call::Read(span) if span.table().is_bits() => Answer::Bits(vec![false; span.count() as usize]),
+        Call::Read(span) => {
+            let held = |at| registers.get(&(request.unit, at)).copied().unwrap_or(0);
+            Answer::Words((span.first()..=span.last()).map(held).collect())
+        }
+        Call::WriteRegister { address, word } => {
+            registers.insert((request.unit, address), word);
+            Answer::Written
+        }
+        _ => Answer::Written,
+    }
 }

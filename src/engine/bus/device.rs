@@ -171,13 +171,9 @@ impl DeviceState {
     }
 
     /// Whether its outputs fall to their safe state when nobody speaks to it, or writes to it.
-    pub(super) fn has_watchdog(&self) -> bool {
+    pub(super) fn wants_feeding(&self) -> bool {
         let device = &self.settings.device;
         device.wire.watchdog.is_some() || device.points.iter().any(|point| point.heartbeat.is_some())
-    }
-
-    pub(super) fn has_heartbeats(&self) -> bool {
-        self.settings.device.points.iter().any(|point| point.heartbeat.is_some())
     }
 
     pub(super) fn has_settings(&self) -> bool {
@@ -215,7 +211,7 @@ impl DeviceState {
             }
         }
         let (index, urgency) = self.polls.most_urgent(now)?;
-        Some((Polled::Read(index, Call::Read(self.polls.read(index).span)), urgency))
+        Some((self.read_call(index), urgency))
     }
 
     /// What has waited longest, wanted at once or not, and for how many of its periods.
@@ -229,7 +225,11 @@ impl DeviceState {
             }
         }
         let (index, waited) = self.polls.longest_waiting(now)?;
-        Some((Polled::Read(index, Call::Read(self.polls.read(index).span)), waited))
+        Some((self.read_call(index), waited))
+    }
+
+    pub(super) fn read_call(&self, index: usize) -> Polled {
+        Polled::Read(index, Call::Read(self.span_of(index)))
     }
 
     fn identification_call(&self) -> Option<Call> {

@@ -1,10 +1,10 @@
 //! One bus as a state machine: what happened goes in, what to do comes out.
 //!
 //! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
-//! `ask_next` chooses the next: the command that has begun, heartbeats that are late, waiting commands,
-//! heartbeats, what somebody asked for, settings that are not as they are wanted, a scan, then whichever
-//! device's read (or identification) is most urgent. Whoever asks without end still does not keep a read that
-//! is due from the wire: [`AHEAD_OF_READS`].
+//! `ask_next` chooses the next: the command that has begun, heartbeats and watchdogs that are late, waiting commands,
+//! heartbeats and watchdogs, what somebody asked for, settings that are not as they are wanted, a scan, then whichever
+//! device's read (or identification) is most urgent. Nobody who asks without end keeps a read that is due from
+//! the wire: [`AHEAD_OF_READS`].
 
 mod change;
 mod commands;
@@ -141,9 +141,9 @@ pub struct Bus {
     stopping: bool,
     /// When something is to be stored next.
     record_due_at: Option<Time>,
-    /// Whether any device has heartbeats, and settings. Most have none, and with many devices looking for
+    /// Whether any device has heartbeats or a watchdog, and settings. Most have none, and with many devices looking for
     /// them costs more than everything else.
-    has_heartbeats: bool,
+    feeds: bool,
     has_settings: bool,
     now: Time,
 }
@@ -231,7 +231,7 @@ impl Bus {
             device.introduce(now, &mut context);
         }
         let record_due_at = devices.iter().filter_map(DeviceState::record_due_at).min();
-        let has_heartbeats = devices.iter().any(DeviceState::has_heartbeats);
+        let feeds = devices.iter().any(DeviceState::wants_feeding);
         let has_settings = devices.iter().any(DeviceState::has_settings);
         Bus {
             name: bus.name.clone(),
@@ -257,7 +257,7 @@ impl Bus {
             load: Load::default(),
             stopping: false,
             record_due_at,
-            has_heartbeats,
+            feeds,
             has_settings,
             now,
         }
@@ -513,10 +513,12 @@ impl Bus {
                 self.send(device, call, Purpose::BeatWrite(point));
                 continue;
             }
-            if self.begin_beat(true)
-                || self.begin_overdue_read()
+            if self.begin_overdue_read()
+                || self.begin_beat(true)
+                || self.feed(true)
                 || self.begin_command()
                 || self.begin_beat(false)
+                || self.feed(false)
                 || self.next_fetch()
                 || self.begin_request()
                 || self.begin_setting()
@@ -577,7 +579,7 @@ impl Bus {
 
     /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.
     fn begin_beat(&mut self, late: bool) -> bool {
-        if !self.has_heartbeats {
+        if !self.feeds {
             return false;
         }
         let now = self.now;
@@ -589,16 +591,32 @@ impl Bus {
         true
     }
 
+    /// Asks a device something whose watchdog wants to be fed. If it is `late`, no command goes before.
+    fn feed(&mut self, late: bool) -> bool {
+        if !self.feeds {
+            return false;
+        }
+        let now = self.now;
+        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+        let due = devices.find_map(|(index, device)| Some((index, device.feed_due(now, late)?)));
+        let Some((device, read)) = due else { return false };
+        let ahead = self.ahead + 1;
+        self.poll(device, self.devices[device].read_call(read));
+        self.ahead = ahead;
+        self.in_flight.iter_mut().for_each(|in_flight| in_flight.gives_way &= !late);
+        true
+    }
+
     /// Not a device that leaves. And one whose watchdog must run out is not spoken to while the broker is away.
     fn may_ask(&self, device: &DeviceState) -> bool {
         let is_to_be_fed =
-            self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.has_watchdog();
+            self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.wants_feeding();
         is_to_be_fed && !device.is_leaving
     }
 
-    /// Whether any device has heartbeats or settings.
+    /// What any device has.
     fn look_what_they_have(&mut self) {
-        self.has_heartbeats = self.devices.iter().any(DeviceState::has_heartbeats);
+        self.feeds = self.devices.iter().any(DeviceState::wants_feeding);
         self.has_settings = self.devices.iter().any(DeviceState::has_settings);
     }
 
@@ -619,7 +637,7 @@ impl Bus {
         };
         let gives_way = matches!(purpose, Purpose::Poll { .. });
         match purpose {
-            Purpose::Command | Purpose::Fetch => self.ahead += 1,
+            Purpose::Command | Purpose::Fetch | Purpose::BeatRead(_) => self.ahead += 1,
             Purpose::Poll { .. } if before.was_wanted() => self.ahead += 1,
             Purpose::Poll { .. } => self.ahead = 0,
             _ => {}

@@ -1,7 +1,8 @@
-//! Heartbeats: registers that must be written again and again, or the device acts on the silence.
+//! Heartbeats and watchdogs: registers that must be written again and again, and devices that must be
+//! spoken to, or the device acts on the silence.
 //!
 //! What is written is what was read from the register just before, so that no older order comes back
-//! and nobody's wish is made true by it.
+//! and nobody's wish is made true by it. A watchdog is fed by any request: a read goes before its time.
 
 use crate::engine::codec::{self, Resolved};
 use crate::engine::command::{words_of, write_call};
@@ -12,7 +13,7 @@ use crate::engine::value::{Decimal, Reading};
 
 use super::{Context, DeviceState, Presence, Severity};
 
-/// So many times within the time that the device allows a heartbeat is due.
+/// So many times within the time that the device allows a heartbeat is due, or a request of any kind.
 const WITHIN: u32 = 3;
 
 /// The registers of one device that want to be written.
@@ -57,24 +58,44 @@ impl DeviceState {
         self.beats.list.iter().find(due).map(|beat| beat.point)
     }
 
-    /// When the next heartbeat is due.
+    /// The read that feeds the watchdog, if nothing else has spoken to the device for a part of its time;
+    /// with `late`, for twice that part.
+    pub(in crate::engine::bus) fn feed_due(&self, now: Time, late: bool) -> Option<usize> {
+        let interval = self.feeding_interval()?;
+        let due = now >= self.served_at + interval * if late { 2 } else { 1 };
+        if due && now >= self.paused_until { self.polls.oldest(now) } else { None }
+    }
+
+    /// When the next heartbeat or watchdog is due.
     pub(in crate::engine::bus) fn beats_at(&self) -> Option<Time> {
         let at = |beat: &Beat| {
             let interval = self.interval_of(beat)?;
             Some(beat.tried_at.map_or(Time::default(), |tried_at| tried_at + interval))
         };
-        self.beats.list.iter().filter_map(at).min()
+        let fed = self.feeding_interval().map(|interval| (self.served_at + interval).max(self.paused_until));
+        self.beats.list.iter().filter_map(at).chain(fed).min()
     }
 
-    /// `None` while no heartbeat is wanted: the device is away or does not answer, the register has no
-    /// meaning in this mode, its time is not known, or 0.
+    fn feeding_interval(&self) -> Option<Duration> {
+        match self.values.reading(self.device().wire.watchdog?) {
+            Reading::Number(seconds) => self.part_of(*seconds),
+            _ => None,
+        }
+    }
+
+    /// `None` also while the register has no meaning in this mode, or its time is not known.
     fn interval_of(&self, beat: &Beat) -> Option<Duration> {
+        codec::resolve(self.device(), beat.point, self.known()).ok()?;
+        let resolved = codec::resolve(self.device(), beat.time, self.known()).ok()?;
+        self.part_of(codec::to_unit(&resolved, self.known()[beat.time]?)?)
+    }
+
+    /// A part of the time that the device allows. `None`: nothing is wanted, since the device is away or
+    /// does not answer, or the time is 0.
+    fn part_of(&self, seconds: Decimal) -> Option<Duration> {
         if self.presence != Presence::Present || self.patience.failures() > 0 {
             return None;
         }
-        codec::resolve(self.device(), beat.point, self.known()).ok()?;
-        let resolved = codec::resolve(self.device(), beat.time, self.known()).ok()?;
-        let seconds = codec::to_unit(&resolved, self.known()[beat.time]?)?;
         let micros = seconds.checked_mul(Decimal::integer(1_000_000))?.to_f64();
         let time = Duration::from_micros(micros.max(0.0) as u64);
         (!time.is_zero()).then_some(time / WITHIN)
