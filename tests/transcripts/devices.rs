@@ -10,6 +10,7 @@ use busker::engine::settings::{
     Settings, Wanted,
 };
 use busker::engine::time::Duration;
+use busker::engine::units::Release;
 use busker::engine::value::Decimal;
 use busker::engine::yaml::Scalar;
 
@@ -62,6 +63,7 @@ pub fn settings(header: &str) -> Settings {
             discovery: says("discovery"),
             prefix: "homeassistant".into(),
             status_topic: "homeassistant/status".into(),
+            minimum_version: Release::USUAL,
         },
         http: Http { listen: None, token: Password::None },
         state_dir: "/nowhere".into(),
