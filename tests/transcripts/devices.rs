@@ -108,6 +108,11 @@ fn device(kind: &str) -> Device {
         "selectable" => selectable(),
         "thresholds" => thresholds(),
         "input" => input(),
+        "awakening" => {
+            let mut device = with(vec![point("level", register(Table::Input, 0, 1), Poll::Fast), order()]);
+            device.wire.connect_delay = Duration::from_millis(800);
+            device
+        }
         "identified" => {
             let mut device = with(vec![point("level", register(Table::Input, 0, 1), Poll::Fast), order()]);
             device.identify = Some(Identify::Names { vendor: "ACME".into(), product: "L1".into() });

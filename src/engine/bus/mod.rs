@@ -133,6 +133,8 @@ pub struct Bus {
     /// Requests in a row that were wanted at once.
     ahead: u32,
     link_state: LinkState,
+    /// A device on this link needs silence behind a connect: nothing is asked before.
+    silent_until: Time,
     /// Requests in a row that no device on this link answered.
     unanswered: u32,
     broker_up: bool,
@@ -251,6 +253,7 @@ impl Bus {
             in_flight: None,
             ahead: 0,
             link_state: LinkState::Down { reason: None, attempts: 0 },
+            silent_until: now,
             unanswered: 0,
             broker_up: true,
             counters,
@@ -308,6 +311,10 @@ impl Bus {
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
             return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
         }
+        if self.now < self.silent_until {
+            let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
+            return records.chain(expiring).chain([self.silent_until]).min();
+        }
         let of_devices =
             self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
         let spared =
@@ -364,6 +371,8 @@ impl Bus {
     // What happened to the link.
 
     fn link_up(&mut self) {
+        let delays = self.devices.iter().map(|device| device.device().wire.connect_delay);
+        self.silent_until = self.now + delays.max().unwrap_or_default();
         match std::mem::replace(&mut self.link_state, LinkState::Up) {
             // The devices are as silent as they were, and are asked as seldom.
             LinkState::Renewing => return,
@@ -508,6 +517,9 @@ impl Bus {
     // What to ask next.
 
     fn ask_next(&mut self) {
+        if self.now < self.silent_until {
+            return;
+        }
         while self.in_flight.is_none() && self.link_state == LinkState::Up {
             if let Some((device, point, call)) = self.beat.take() {
                 self.send(device, call, Purpose::BeatWrite(point));
