@@ -256,7 +256,7 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
     for round in 0u128.. {
         ticks.tick().await;
         // All are asked, so that none is asked for nothing the next time.
-        let stirred = plant.buses().iter().fold(false, |stirred, bus| bus.take_stirred() || stirred);
+        let stirred = plant.buses().iter().filter(|bus| bus.take_stirred()).count() > 0;
         let broker = plant.broker();
         let others = (broker.connected, broker.client_id_taken, reporter.configuration_error());
         let is_new = seen.as_ref() != Some(&others) || stirred || !responding;
