@@ -5,6 +5,7 @@
 //! millisecond late costs a tenth of a fast line.
 
 use std::num::NonZeroU64;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -17,10 +18,13 @@ use crate::edge::clock::Clock;
 use crate::edge::guarded_link::{GuardedLink, Woken, wait};
 use crate::edge::link::{Link, Lost};
 use crate::edge::punctual::Punctual;
+use crate::edge::recordings;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Action, Bus, Event, Severity};
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
+use crate::engine::recorder::Recording;
+use crate::engine::request::Request;
 use crate::engine::settings::Settings;
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
@@ -61,7 +65,7 @@ pub fn start(
     let (letters, inbox) = sync_channel(WAITING_MAX);
     let bell = Bell::new()?;
     let stop = Arc::new(AtomicBool::new(false));
-    let (thread_bell, thread_stop) = (bell.clone(), stop.clone());
+    let (thread_bell, thread_stop, to_itself) = (bell.clone(), stop.clone(), letters.clone());
     let thread =
         std::thread::Builder::new().name(format!("bus-{}", settings.buses[index].name)).spawn(move || {
             let bus = Bus::new(clock.now(), &settings, index, &state.memories());
@@ -77,6 +81,8 @@ pub fn start(
                 bus,
                 port,
                 inbox,
+                to_itself,
+                saving: Vec::new(),
                 bell,
                 stop,
                 stopping,
@@ -151,6 +157,10 @@ struct BusThread {
     bus: Bus,
     port: Port,
     inbox: Receiver<Letter>,
+    /// For threads that it starts.
+    to_itself: SyncSender<Letter>,
+    /// Recordings that become files; a memory card may take seconds, and the line waits for nobody.
+    saving: Vec<JoinHandle<()>>,
     bell: Bell,
     stop: Arc<AtomicBool>,
     stopping: bool,
@@ -166,6 +176,8 @@ impl BusThread {
         loop {
             self.perform();
             if self.bus.is_finished() {
+                // What is being saved was wanted.
+                self.saving.into_iter().for_each(|saving| drop(saving.join()));
                 return;
             }
             if self.wait() {
@@ -190,7 +202,7 @@ impl BusThread {
             match action {
                 Action::Send { request, not_before, timeout } => {
                     let begun = match &mut self.port {
-                        Port::Open(link) => link.begin(&request, not_before, timeout),
+                        Port::Open(link) => link.begin(&request, not_before, timeout, self.bus.tape()),
                         _ => Err(Lost("the link is not open".into())),
                     };
                     self.line_said(begun);
@@ -204,6 +216,7 @@ impl BusThread {
                 }
                 Action::Publish(message) => (self.publish)(message),
                 Action::Store(record) => self.state.store(record),
+                Action::Record { recording, request } => self.record(*recording, request),
                 Action::Reopen { after } => self.port = Port::Waiting(self.clock.now() + after),
                 Action::Say(Severity::Info, text) => tracing::info!("{text}"),
                 Action::Say(Severity::Warning, text) => tracing::warn!("{text}"),
@@ -288,7 +301,7 @@ impl BusThread {
                 Err(TryRecvError::Disconnected) => self.lose(Lost("it could not be opened".into())),
             },
             Port::Open(link) => {
-                let said = link.advance();
+                let said = link.advance(self.bus.tape());
                 self.line_said(said);
             }
         }
@@ -306,6 +319,26 @@ impl BusThread {
             tracing::error!("no thread can be started: {error}");
         }
         Port::Opening(receiver)
+    }
+
+    /// Makes a file of a recording, on a thread of its own.
+    fn record(&mut self, recording: Recording, request: Option<Request>) {
+        self.saving.retain(|saving| !saving.is_finished());
+        let (to_itself, bell, clock) = (self.to_itself.clone(), self.bell.clone(), self.clock);
+        let (folder, keep) = (self.state.recordings().map(Path::to_path_buf), self.settings.recorder.keep);
+        let saving = std::thread::Builder::new().name("recording".into()).spawn(move || {
+            let result = match folder {
+                Some(folder) => recordings::save(&folder, &recording, clock, keep),
+                None => Err("nothing is kept".into()),
+            };
+            // When the bus has ended, nobody asks any more.
+            let _ = to_itself.try_send(Letter::Event(Event::Recorded(request, result)));
+            bell.ring();
+        });
+        match saving {
+            Ok(saving) => self.saving.push(saving),
+            Err(error) => tracing::error!("no thread can be started: {error}"),
+        }
     }
 
     fn line_said(&mut self, said: Result<Option<Reply>, Lost>) {
