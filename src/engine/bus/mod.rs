@@ -10,6 +10,7 @@ mod change;
 mod commands;
 mod device;
 mod fetch;
+mod load;
 mod pause;
 mod recording;
 mod requests;
@@ -33,6 +34,7 @@ use crate::engine::topics::Message;
 use commands::{Active, Settling};
 use device::{DeviceState, Polled, Turn};
 use fetch::Fetch;
+use load::Load;
 use recording::Recorder;
 pub use recording::Saved;
 use requests::Requests;
@@ -689,36 +691,4 @@ impl Bus {
 /// What a read costs, until a device's own latency is measured.
 fn cost(link: &Link) -> Cost {
     Cost::of(link, Duration::from_millis(5))
-}
-
-/// The share of time in which the wire is busy: two buckets of a minute.
-#[derive(Clone, Copy, Debug, Default)]
-struct Load {
-    minute: u64,
-    busy: Duration,
-    busy_before: Option<Duration>,
-}
-
-impl Load {
-    const MINUTE: u64 = 60_000_000;
-
-    fn add(&mut self, from: Time, until: Time) {
-        let minute = until.0 / Load::MINUTE;
-        if minute != self.minute {
-            self.busy_before = Some(if minute == self.minute + 1 { self.busy } else { Duration::ZERO });
-            (self.minute, self.busy) = (minute, Duration::ZERO);
-        }
-        self.busy += until - from;
-    }
-
-    /// 0 to 1, over the last whole minute; before there is one, since the start.
-    fn share(&self, now: Time) -> f64 {
-        let (busy, time) = match (self.busy_before, now.0 / Load::MINUTE) {
-            (_, minute) if minute > self.minute + 1 => (Duration::ZERO, Duration::from_secs(60)),
-            (_, minute) if minute == self.minute + 1 => (self.busy, Duration::from_secs(60)),
-            (Some(before), _) => (before, Duration::from_secs(60)),
-            (None, _) => (self.busy, now - Time::default()),
-        };
-        if time.is_zero() { 0.0 } else { (busy.as_secs_f64() / time.as_secs_f64()).min(1.0) }
-    }
 }
