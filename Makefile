@@ -3,7 +3,7 @@
 # Appended to PATH, so that nobody's own programs are hidden.
 WITH_MOSQUITTO = tools=$$(scripts/get-mosquitto) && PATH="$$PATH:$$tools"
 
-.PHONY: demo test test-page test-home-assistant lint goldens bench
+.PHONY: demo test test-page test-wireshark test-home-assistant lint goldens bench
 
 # The whole program without hardware: simulated devices, a broker, the gateway. Ctrl-C ends it.
 demo:
@@ -17,6 +17,11 @@ test:
 # The status page in a real Chromium, which is installed where it is missing. Pictures go to target/page.
 test-page:
 	@$(WITH_MOSQUITTO) && exec tests/page/run
+
+# What Wireshark makes of recordings; tshark (128 MB) is installed where it is missing.
+test-wireshark:
+	@$(WITH_MOSQUITTO) && tshark=$$(scripts/get-tshark) && PATH="$$PATH:$$tshark" \
+		exec cargo test --locked --test line wireshark -- --include-ignored
 
 # The discovery messages against a real Home Assistant core; downloads about 800 MB the first time.
 test-home-assistant:

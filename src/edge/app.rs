@@ -222,14 +222,16 @@ pub(super) fn watched(
     let memories = state.memories();
     let of_bus = |(index, bus): (usize, &Arc<BusHandle>)| {
         let first = Bus::new(clock.now(), settings, index, &memories).summary(clock.now());
-        let bus = bus.clone();
+        let (bus, of_recording) = (bus.clone(), bus.clone());
+        let ask_recording =
+            move || of_recording.inspect(|bus, now| bus.recording(now, "on request over HTTP"));
         let ask = move |detail| {
             bus.inspect(move |bus, now| match detail {
                 Detail::Devices => bus.summary(now),
                 Detail::Points => bus.report(now),
             })
         };
-        Arc::new(Watched::new(ask, first))
+        Arc::new(Watched::new(ask, ask_recording, first))
     };
     buses.iter().enumerate().map(of_bus).collect()
 }

@@ -1,18 +1,23 @@
 //! Performs what [`crate::engine::bus::Bus`] decides: its letters, its link from closed to open and back, and
 //! the messages that it publishes. It waits for nothing; its thread does ([`crate::edge::bus_thread`]).
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::thread::JoinHandle;
 
 use crate::edge::bell::Bell;
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::{Link, Lost};
+use crate::edge::recordings;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Action, Bus, Event, Severity};
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
+use crate::engine::recorder::Recording;
+use crate::engine::request::Request;
 use crate::engine::settings::Settings;
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
@@ -32,11 +37,16 @@ pub(super) type Look = Box<dyn FnOnce(&Bus, Time) + Send>;
 /// The near end of a handle's ways to its bus.
 pub(super) struct Ears {
     pub(super) inbox: Receiver<Letter>,
+    /// For threads that the bus starts.
+    pub(super) to_itself: SyncSender<Letter>,
     pub(super) bell: Bell,
     pub(super) stop: Arc<AtomicBool>,
     pub(super) stirred: Arc<AtomicBool>,
-    pub(super) ended: SyncSender<()>,
+    pub(super) ended: SyncSender<Saving>,
 }
+
+/// Recordings that become files; a memory card may take seconds, and no line waits for it.
+pub(super) type Saving = Vec<JoinHandle<()>>;
 
 /// The link, from closed to open and back.
 enum Port {
@@ -60,6 +70,8 @@ pub(super) struct BusRunner {
     bus: Bus,
     port: Port,
     inbox: Receiver<Letter>,
+    to_itself: SyncSender<Letter>,
+    saving: Saving,
     bell: Bell,
     stop: Arc<AtomicBool>,
     stopping: bool,
@@ -67,8 +79,8 @@ pub(super) struct BusRunner {
     stirred: Arc<AtomicBool>,
     /// The link was opened since somebody asked.
     is_newly_open: bool,
-    /// Whoever waits for the end hears of it.
-    ended: SyncSender<()>,
+    /// Whoever waits for the end hears of it, and of what is still being saved.
+    ended: SyncSender<Saving>,
 }
 
 impl BusRunner {
@@ -81,7 +93,7 @@ impl BusRunner {
         ears: Ears,
     ) -> BusRunner {
         let bus = Bus::new(clock.now(), &settings, index, &state.memories());
-        let Ears { inbox, bell, stop, stirred, ended } = ears;
+        let Ears { inbox, to_itself, bell, stop, stirred, ended } = ears;
         BusRunner {
             settings,
             index,
@@ -91,6 +103,8 @@ impl BusRunner {
             bus,
             port: Port::Closed,
             inbox,
+            to_itself,
+            saving: Saving::new(),
             bell,
             stop,
             stopping: false,
@@ -111,7 +125,7 @@ impl BusRunner {
     /// The last thing that is done with it.
     pub(super) fn finish(self) {
         // Perhaps nobody waits.
-        let _ = self.ended.try_send(());
+        let _ = self.ended.try_send(self.saving);
     }
 
     pub(super) fn clock(&self) -> Clock {
@@ -172,7 +186,7 @@ impl BusRunner {
             match action {
                 Action::Send { request, not_before, timeout } => {
                     let begun = match &mut self.port {
-                        Port::Open(link) => link.begin(&request, not_before, timeout),
+                        Port::Open(link) => link.begin(&request, not_before, timeout, self.bus.tape()),
                         _ => Err(Lost("the link is not open".into())),
                     };
                     self.line_said(begun);
@@ -192,6 +206,7 @@ impl BusRunner {
                     (self.publish)(message);
                 }
                 Action::Store(record) => self.state.store(record),
+                Action::Record { recording, request } => self.record(*recording, request),
                 Action::Reopen { after } => {
                     self.port = Port::Waiting(self.clock.now() + after);
                     self.stir();
@@ -251,7 +266,7 @@ impl BusRunner {
                 Err(TryRecvError::Disconnected) => self.lose(Lost("it could not be opened".into())),
             },
             Port::Open(link) => {
-                let said = link.advance();
+                let said = link.advance(self.bus.tape());
                 self.line_said(said);
             }
         }
@@ -273,6 +288,26 @@ impl BusRunner {
             tracing::error!("no thread can be started: {error}");
         }
         Port::Opening(receiver)
+    }
+
+    /// Makes a file of a recording, on a thread of its own.
+    fn record(&mut self, recording: Recording, request: Option<Request>) {
+        self.saving.retain(|saving| !saving.is_finished());
+        let (to_itself, bell, clock) = (self.to_itself.clone(), self.bell.clone(), self.clock);
+        let (folder, keep) = (self.state.recordings().map(Path::to_path_buf), self.settings.recorder.keep);
+        let saving = std::thread::Builder::new().name("recording".into()).spawn(move || {
+            let result = match folder {
+                Some(folder) => recordings::save(&folder, &recording, clock, keep),
+                None => Err("nothing is kept".into()),
+            };
+            // When the bus has ended, nobody asks any more.
+            let _ = to_itself.try_send(Letter::Event(Event::Recorded(request, result)));
+            bell.ring();
+        });
+        match saving {
+            Ok(saving) => self.saving.push(saving),
+            Err(error) => tracing::error!("no thread can be started: {error}"),
+        }
     }
 
     fn line_said(&mut self, said: Result<Option<Reply>, Lost>) {

@@ -15,7 +15,7 @@ use rustix::event::epoll;
 use tokio::sync::oneshot;
 
 use crate::edge::bell::Bell;
-use crate::edge::bus_runner::{BusRunner, Ears, Letter, WAITING_MAX};
+use crate::edge::bus_runner::{BusRunner, Ears, Letter, Saving, WAITING_MAX};
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::{Woken, wait};
 use crate::edge::link::{Lost, timespec};
@@ -32,7 +32,7 @@ pub struct BusHandle {
     bell: Bell,
     stop: Arc<AtomicBool>,
     stirred: Arc<AtomicBool>,
-    ended: Mutex<Option<Receiver<()>>>,
+    ended: Mutex<Option<Receiver<Saving>>>,
 }
 
 /// Too much waits for the bus already; what was to be sent is dropped.
@@ -72,11 +72,12 @@ impl BusHandle {
         self.bell.ring();
     }
 
-    /// Waits for the bus's end.
+    /// Waits for the bus's end, and until what it recorded is saved.
     pub fn join(&self) {
-        let ended = lock(&self.ended).take();
-        if ended.is_some_and(|ended| ended.recv().is_err()) {
-            tracing::error!("a bus ended in a panic");
+        let Some(ended) = lock(&self.ended).take() else { return };
+        match ended.recv() {
+            Ok(saving) => saving.into_iter().for_each(|saving| drop(saving.join())),
+            Err(_) => tracing::error!("a bus ended in a panic"),
         }
     }
 
@@ -113,7 +114,14 @@ impl Threads {
             Some(shared) => shared.bell.clone(),
             None => Bell::new()?,
         };
-        let ears = Ears { inbox, bell: bell.clone(), stop: stop.clone(), stirred: stirred.clone(), ended };
+        let ears = Ears {
+            inbox,
+            to_itself: letters.clone(),
+            bell: bell.clone(),
+            stop: stop.clone(),
+            stirred: stirred.clone(),
+            ended,
+        };
         let name = format!("bus-{}", settings.buses[index].name);
         let runner = move || BusRunner::new(settings, index, clock, state, publish, ears);
         match shared {

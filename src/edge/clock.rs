@@ -21,10 +21,19 @@ impl Clock {
     }
 
     /// The date, for texts; nothing may be decided by it, since it can jump.
-    #[expect(clippy::disallowed_methods, reason = "this is the place that asks")]
     pub fn today(self) -> Date {
-        let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-        Date(since.map_or(0, |since| since.as_secs()))
+        Date(self.since_1970().as_secs())
+    }
+
+    /// The time since 1970, to be told and nothing else: it can jump.
+    #[expect(clippy::disallowed_methods, reason = "this is the place that asks")]
+    pub fn since_1970(self) -> Duration {
+        SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default()
+    }
+
+    /// When `time` was, as people tell it, if nobody has set the clock since.
+    pub fn since_1970_at(self, time: Time) -> Duration {
+        self.since_1970().saturating_sub(self.now() - time)
     }
 
     /// How long from now until `time`; zero when it has passed.

@@ -9,6 +9,7 @@ use crate::edge::clock::Clock;
 use crate::edge::link::{Link, Lost, timespec};
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Reply, Request, RequestError};
+use crate::engine::recorder::Tape;
 use crate::engine::time::{Duration, Time};
 
 /// Reads in a row before anything else has its turn; a line that babbles must not stop the rest.
@@ -36,13 +37,14 @@ impl GuardedLink {
         request: &Request,
         not_before: Time,
         timeout: Duration,
+        tape: &mut Tape,
     ) -> Result<Option<Reply>, Lost> {
         let reply = self.guard.begin(self.clock.now(), request, timeout);
         self.not_before = if reply.is_none() { Some(not_before) } else { None };
         match (&self.guard, self.send_at()) {
             // What is still to be read belongs to older transactions, and says so.
-            (Guard::Tcp(_), Some(at)) if self.clock.now() >= at => self.send_or_wake(),
-            (Guard::Rtu(_), Some(at)) if self.clock.now() >= at => self.advance(),
+            (Guard::Tcp(_), Some(at)) if self.clock.now() >= at => self.send_or_wake(tape),
+            (Guard::Rtu(_), Some(at)) if self.clock.now() >= at => self.advance(tape),
             _ => usable(reply),
         }
     }
@@ -62,22 +64,24 @@ impl GuardedLink {
         self.came_at = Some(time);
     }
 
-    /// Does what is due: reads, sends, tells the guard the time. Never waits.
-    pub fn advance(&mut self) -> Result<Option<Reply>, Lost> {
+    /// Does what is due: reads, sends, tells the guard the time. Never waits. What is sent and what
+    /// comes goes on the tape.
+    pub fn advance(&mut self, tape: &mut Tape) -> Result<Option<Reply>, Lost> {
         let mut buffer = [0; 512];
         let mut came_at = self.came_at.take();
         for _ in 0..READS_MAX {
             let Some(count) = self.link.read(&mut buffer)? else { break };
             let time = came_at.take().unwrap_or_else(|| self.clock.now());
+            tape.heard(time, &buffer[..count]);
             let reply = self.guard.received(time, &buffer[..count]);
             if reply.is_some() {
                 return usable(reply);
             }
         }
-        self.send_or_wake()
+        self.send_or_wake(tape)
     }
 
-    fn send_or_wake(&mut self) -> Result<Option<Reply>, Lost> {
+    fn send_or_wake(&mut self, tape: &mut Tape) -> Result<Option<Reply>, Lost> {
         let now = self.clock.now();
         match self.not_before {
             Some(not_before) if now >= not_before.max(self.guard.earliest_send(now)) => {
@@ -85,6 +89,7 @@ impl GuardedLink {
                 let sent_at = self.clock.now();
                 self.link.write(self.guard.frame())?;
                 self.guard.sent(sent_at);
+                tape.sent(sent_at, self.guard.frame());
                 Ok(None)
             }
             Some(_) => Ok(None),
@@ -106,11 +111,12 @@ impl GuardedLink {
 
     /// Asks one question and waits for its reply: for verbs that talk to one device by hand.
     pub fn ask(&mut self, request: &Request, timeout: Duration) -> Result<Reply, Lost> {
-        if let Some(reply) = self.begin(request, Time(0), timeout)? {
+        let mut tape = Tape::new(0);
+        if let Some(reply) = self.begin(request, Time(0), timeout, &mut tape)? {
             return Ok(reply);
         }
         loop {
-            if let Some(reply) = self.advance()? {
+            if let Some(reply) = self.advance(&mut tape)? {
                 return Ok(reply);
             }
             wait(Some(self), None, self.wake_at().map(|at| self.clock.until(at)))?;

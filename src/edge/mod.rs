@@ -13,6 +13,7 @@ pub mod metrics;
 pub mod mqtt;
 pub mod plant;
 pub mod punctual;
+pub mod recordings;
 pub mod reload;
 pub mod reports;
 pub mod runtime;

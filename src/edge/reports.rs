@@ -6,6 +6,7 @@ use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
 
 use crate::engine::health::{BrokerReport, BusHealth, BusReport, GatewayReport};
+use crate::engine::recorder::Recording;
 use crate::engine::time::Duration;
 
 /// A bus thread answers between two requests on the wire. One that needs longer is stuck.
@@ -13,6 +14,9 @@ const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 
 /// Asks a bus, which answers through the channel.
 pub type Ask = Box<dyn Fn(Detail) -> oneshot::Receiver<BusReport> + Send + Sync>;
+
+/// Asks a bus what was last on its wire; nothing is recorded where it answers with nothing.
+pub type AskRecording = Box<dyn Fn() -> oneshot::Receiver<Option<Recording>> + Send + Sync>;
 
 /// How much is asked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,6 +29,7 @@ pub enum Detail {
 /// A bus that is asked how it is.
 pub struct Watched {
     ask: Ask,
+    ask_recording: AskRecording,
     /// What it last said, for the time in which it says nothing.
     last: Mutex<BusReport>,
 }
@@ -33,9 +38,10 @@ impl Watched {
     /// `first` is how the bus is before it has said anything.
     pub fn new(
         ask: impl Fn(Detail) -> oneshot::Receiver<BusReport> + Send + Sync + 'static,
+        ask_recording: impl Fn() -> oneshot::Receiver<Option<Recording>> + Send + Sync + 'static,
         first: BusReport,
     ) -> Watched {
-        Watched { ask: Box::new(ask), last: Mutex::new(first) }
+        Watched { ask: Box::new(ask), ask_recording: Box::new(ask_recording), last: Mutex::new(first) }
     }
 }
 
@@ -73,6 +79,14 @@ impl Reporter {
         lock(&self.configuration_error).clone()
     }
 
+    /// What was last on the wire of this bus.
+    pub async fn recording(&self, bus: &str) -> Result<Recording, NoRecording> {
+        let named = |watched: &&Arc<Watched>| lock(&watched.last).name == bus;
+        let watched = lock(&self.buses).iter().find(named).cloned().ok_or(NoRecording::NoSuchBus)?;
+        let answer = timeout_at(Instant::now() + ANSWER_WITHIN, (watched.ask_recording)()).await;
+        answer.ok().and_then(Result::ok).ok_or(NoRecording::Stuck)?.ok_or(NoRecording::Off)
+    }
+
     /// The gateway as it is now; takes a second if a bus is stuck, and no longer if several are.
     pub async fn report(&self, detail: Detail) -> GatewayReport {
         let deadline = Instant::now() + ANSWER_WITHIN;
@@ -101,6 +115,15 @@ impl Reporter {
         let configuration_error = lock(&self.configuration_error).clone();
         GatewayReport { broker: (self.broker)(), buses, configuration_error }
     }
+}
+
+/// Why there is no recording of a bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NoRecording {
+    NoSuchBus,
+    Off,
+    /// The bus does not answer.
+    Stuck,
 }
 
 /// What was last said of the points is kept for when the bus is stuck.
@@ -161,7 +184,8 @@ mod tests {
         let gone: Ask = Box::new(|_| oneshot::channel().1);
         let broker = || BrokerReport { connected: true, ..BrokerReport::default() };
         let asks = [(silent, bus("silent", 1)), (good, bus("good", 2)), (gone, bus("gone", 3))];
-        let watched = asks.map(|(ask, first)| Arc::new(Watched { ask, last: Mutex::new(first) }));
+        let no_recording = || oneshot::channel().1;
+        let watched = asks.map(|(ask, first)| Arc::new(Watched::new(ask, no_recording, first)));
         let reporter = Reporter::new(broker, watched.to_vec());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
         let report = runtime.expect("a runtime").block_on(reporter.report(Detail::Devices));

@@ -25,6 +25,7 @@ pub struct StateFiles {
     /// Devices whose files must not be overwritten.
     damaged: Mutex<BTreeSet<String>>,
     folder: PathBuf,
+    recordings: Option<PathBuf>,
     desk: Arc<Desk>,
     thread: Mutex<Option<JoinHandle<()>>>,
     keeps: bool,
@@ -46,14 +47,15 @@ struct Waiting {
 impl StateFiles {
     /// Keeps nothing, and remembers nothing.
     pub fn nowhere() -> StateFiles {
-        StateFiles::unkept(Memories { unkept: Some("nothing is kept".into()), ..Memories::default() })
+        StateFiles::unkept(Memories { unkept: Some("nothing is kept".into()), ..Memories::default() }, None)
     }
 
-    fn unkept(memories: Memories) -> StateFiles {
+    fn unkept(memories: Memories, recordings: Option<PathBuf>) -> StateFiles {
         StateFiles {
             damaged: Mutex::default(),
             memories: Mutex::new(memories),
             folder: PathBuf::new(),
+            recordings,
             desk: Arc::default(),
             thread: Mutex::default(),
             keeps: false,
@@ -86,7 +88,8 @@ impl StateFiles {
                 "{reason}; counts of EEPROM writes end with this run, and `settings` are only compared, \
                  except where they are enforced"
             );
-            return Ok(StateFiles::unkept(memories));
+            // They may find room where a damaged memory must not be overwritten.
+            return Ok(StateFiles::unkept(memories, Some(state_dir.join("recordings"))));
         }
         let desk = Arc::<Desk>::default();
         let (of_thread, of_files) = (desk.clone(), folder.clone());
@@ -98,10 +101,16 @@ impl StateFiles {
             memories: Mutex::new(memories),
             damaged: Mutex::default(),
             folder: of_files,
+            recordings: Some(state_dir.join("recordings")),
             desk,
             thread: Mutex::new(Some(thread)),
             keeps: true,
         })
+    }
+
+    /// Where recordings of what was on the wire are kept, if they are.
+    pub fn recordings(&self) -> Option<&Path> {
+        self.recordings.as_deref()
     }
 
     /// What is remembered now.

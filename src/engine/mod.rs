@@ -19,9 +19,10 @@ pub mod units;
 pub mod wanted;
 pub mod yaml;
 
-// Ask: requests, replies, and which come when.
+// Ask: requests, replies, which come when, and what was last on the wire.
 pub mod modbus;
 pub mod plan;
+pub mod recorder;
 pub mod schedule;
 
 // Understand: who answers, what is known of it, and what changed.

@@ -54,7 +54,9 @@ pub fn compare(old: &Settings, new: &Settings) -> Change {
     if concerns_all(old) != concerns_all(new) {
         return Change::Everything;
     }
-    let rules = |settings: &Settings| (settings.republish, settings.on_broker_loss, settings.eeprom);
+    let rules = |settings: &Settings| {
+        (settings.republish, settings.on_broker_loss, settings.eeprom, settings.recorder)
+    };
     let same_rules = rules(old) == rules(new);
     let fate = |bus: &Bus| match old.buses.iter().find(|other| other.name == bus.name) {
         None => Fate::Begins,
@@ -182,6 +184,7 @@ devices:
         );
         check(&[("\nmqtt:", "\neeprom: {daily: 7}\nmqtt:")], "a restarts, b restarts");
         check(&[("\nmqtt:", "\nrepublish: 5m\nmqtt:")], "a restarts, b restarts");
+        check(&[("\nmqtt:", "\nrecorder: {kilobytes: 0}\nmqtt:")], "a restarts, b restarts");
         check(&[("'mqtt://localhost'", "'mqtt://localhost', base_topic: house")], "everything");
         check(&[("\nmqtt:", "\nhome_assistant: {discovery: false}\nmqtt:")], "everything");
         check(&[("\nmqtt:", "\nstate_dir: /tmp\nmqtt:")], "everything");

@@ -30,11 +30,20 @@ pub enum Verb {
     Scan,
     Refresh,
     Pause,
+    Record,
 }
 
 impl Verb {
-    const ALL: [Verb; 7] =
-        [Verb::Read, Verb::Write, Verb::Identify, Verb::Diagnostics, Verb::Scan, Verb::Refresh, Verb::Pause];
+    const ALL: [Verb; 8] = [
+        Verb::Read,
+        Verb::Write,
+        Verb::Identify,
+        Verb::Diagnostics,
+        Verb::Scan,
+        Verb::Refresh,
+        Verb::Pause,
+        Verb::Record,
+    ];
 
     pub const fn name(self) -> &'static str {
         match self {
@@ -45,6 +54,7 @@ impl Verb {
             Verb::Scan => "scan",
             Verb::Refresh => "refresh",
             Verb::Pause => "pause",
+            Verb::Record => "record",
         }
     }
 
@@ -57,6 +67,7 @@ impl Verb {
             Verb::Scan => &["bus", "units", "transaction"],
             Verb::Refresh => &["device", "point", "transaction"],
             Verb::Pause => &["bus", "device", "for", "transaction"],
+            Verb::Record => &["bus", "device", "transaction"],
         }
     }
 
@@ -68,6 +79,7 @@ impl Verb {
             Verb::Scan => r#"{"bus":"basement","units":"1..247","transaction":"1"}"#,
             Verb::Refresh => r#"{"device":"heating_relays","point":"relay_1","transaction":"1"}"#,
             Verb::Pause => r#"{"bus":"basement","for":"10m","transaction":"1"}"#,
+            Verb::Record => r#"{"bus":"basement","transaction":"1"}"#,
         }
     }
 }
@@ -112,6 +124,8 @@ pub enum Wish {
         time: Duration,
         until: Date,
     },
+    /// A file of what was last on the wire.
+    Record,
 }
 
 /// Which units are asked, and what is known of devices that may be found there.
@@ -272,16 +286,7 @@ impl Desk {
                 Ok((bus, Wish::Scan(Scan { first, last, known: self.known(), ticket })))
             }
             Verb::Pause => {
-                let bus = match (object.text("bus")?, object.text("device")?) {
-                    (Some(bus), None) => self.bus(bus)?,
-                    (None, Some(_)) => self.device(&object)?.1,
-                    (None, None) => return Err(object.missing("bus")),
-                    (Some(_), Some(_)) => {
-                        return Err(
-                            "`bus` and `device` stand beside each other; leave one of them out".into()
-                        );
-                    }
-                };
+                let bus = self.bus_or_device(&object)?;
                 let text = object.text("for")?.ok_or_else(|| object.missing("for"))?;
                 let time = <Duration as Scalar>::parse(text)?;
                 if time > PAUSE_LONGEST {
@@ -289,6 +294,7 @@ impl Desk {
                 }
                 Ok((bus, Wish::Pause { time, until: today + time }))
             }
+            Verb::Record => Ok((self.bus_or_device(&object)?, Wish::Record)),
         }
     }
 
@@ -308,6 +314,18 @@ impl Desk {
             let names: Vec<&str> = self.buses.iter().map(|(name, _)| name.as_str()).collect();
             format!("there is no bus `{name}`; {}", list_of_choices(name, &names))
         })
+    }
+
+    /// The bus that is named, or that of the device that is.
+    fn bus_or_device(&self, object: &Object) -> Result<usize, String> {
+        match (object.text("bus")?, object.text("device")?) {
+            (Some(bus), None) => self.bus(bus),
+            (None, Some(_)) => Ok(self.device(object)?.1),
+            (None, None) => Err(object.missing("bus")),
+            (Some(_), Some(_)) => {
+                Err("`bus` and `device` stand beside each other; leave one of them out".into())
+            }
+        }
     }
 
     /// `1..20` or `7`; without it all units of a line.
@@ -473,6 +491,8 @@ devices:
             1,
             "Pause { time: 600s, until: Date(600) }",
         );
+        check_asks("record", r#"{"bus":"plant"}"#, 1, "Record");
+        check_asks("record", r#"{"device":"relays"}"#, 0, "Record");
         check_asks("pause", r#"{"bus":"basement","for":"0s"}"#, 0, "Pause { time: 0ns, until: Date(0) }");
         let found = desk().take(Date(0), "scan", r#"{"bus":"plant","units":"3..255"}"#, false);
         let Decision::Ask(1, Request { wish: Wish::Scan(scan), .. }) = found else { panic!("{found:?}") };

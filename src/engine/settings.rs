@@ -20,6 +20,7 @@ pub struct Settings {
     pub republish: Duration,
     pub on_broker_loss: OnBrokerLoss,
     pub eeprom: Eeprom,
+    pub recorder: Recorder,
     pub buses: Vec<Bus>,
     pub devices: Vec<DeviceSettings>,
 }
@@ -140,6 +141,18 @@ pub struct Eeprom {
     pub interval: Duration,
     /// All points of a device together not more often in 24 hours.
     pub daily: u32,
+}
+
+/// What is kept of what was last on the wire.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Recorder {
+    /// Of each bus, in memory; 0: nothing.
+    pub bytes: usize,
+    /// The shortest time between two files that are saved because something went wrong; `None`: none
+    /// is.
+    pub on_error: Option<Duration>,
+    /// So many files of each bus; an older one goes.
+    pub keep: usize,
 }
 
 #[derive(Clone, Debug, PartialEq)]

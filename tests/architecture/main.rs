@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const ENGINE_ORDER: &[&[&str]] = &[
     &["time", "value", "address"],
     &["yaml", "device", "test_device", "codec", "units", "settings", "profile", "wanted", "configuration"],
-    &["modbus", "plan", "schedule"],
+    &["modbus", "recorder", "plan", "schedule"],
     &["identity", "state"],
     &["topics", "health", "feed", "homeassistant", "outbox", "connection"],
     &["command", "memory", "upkeep", "request", "reload", "bus"],

@@ -2,8 +2,10 @@
 //! fault is counted as what it was, and the next reading is right.
 
 mod by_hand;
+mod pcapng;
 #[path = "../support/peer.rs"]
 mod peer;
+mod recorder;
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -316,6 +318,11 @@ struct Gateway {
 
 impl Gateway {
     fn start(peer: &Peer, devices: &str) -> Gateway {
+        Gateway::start_with(peer, "", devices)
+    }
+
+    /// With more lines of configuration.
+    fn start_with(peer: &Peer, sections: &str, devices: &str) -> Gateway {
         peer.hold(1, 4, 0, 100);
         peer.hold(1, 4, 100, 500);
         peer.hold(2, 4, 0, 700);
@@ -323,7 +330,7 @@ impl Gateway {
         let observer = Observer::of(&broker);
         let configuration = format!(
             "home_assistant: {{discovery: false}}
-buses:
+{sections}buses:
   line: {{{}, response_timeout: {TIMEOUT}ms}}
 devices:
 {devices}",

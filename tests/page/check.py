@@ -207,6 +207,15 @@ def main(stack):
     ticks = page.evaluate("[...document.querySelectorAll('#device-meter figure:last-child svg text')].map((t) => t.textContent)")
     assert "0" in ticks and "128" in ticks, ticks
 
+    # What was last on the wire comes as a file, for who knows the token.
+    page.ask("Page.setDownloadBehavior", behavior="allow", downloadPath=folder)
+    page.evaluate("[...document.querySelectorAll('.bus')].find((bus) => bus.innerText.startsWith('basement')).querySelector('a.tape').click()")
+    end = time.monotonic() + PATIENCE
+    while not (files := list(pathlib.Path(folder).glob("basement-*Z.pcapng"))) and time.monotonic() < end:
+        time.sleep(0.05)
+    begin = files[0].read_bytes()[:12]
+    assert begin[:4] == b"\n\r\r\n" and begin[8:] == b"M<+\x1a", begin
+
     # Without a mouse: Tab comes to what can be opened, Enter opens it.
     page.evaluate("document.querySelector('#device-relays details.setting summary').focus()")
     page.press("Enter", 13, "\r")

@@ -214,7 +214,7 @@ impl World {
                 Action::Reopen { after } => {
                     self.close(self.now + after);
                 }
-                Action::Store(_) | Action::Say(..) => {}
+                Action::Store(_) | Action::Record { .. } | Action::Say(..) => {}
             }
         }
     }

@@ -119,7 +119,7 @@ pub struct Busker {
     log: Arc<Mutex<String>>,
     /// `host:port`
     http: Option<String>,
-    _folder: TempDir,
+    folder: TempDir,
 }
 
 impl Busker {
@@ -160,7 +160,7 @@ impl Busker {
                 *written.lock().expect("nobody panics with it") += &format!("{line}\n");
             }
         });
-        Busker { child, log, http: None, _folder: folder }
+        Busker { child, log, http: None, folder }
     }
 
     /// What it said so far on standard error.
@@ -173,6 +173,19 @@ impl Busker {
         let url = format!("http://{}{path}", self.http.as_ref()?);
         let agent: ureq::Agent = ureq::Agent::config_builder().http_status_as_error(false).build().into();
         agent.get(&url).call().ok()?.body_mut().read_to_string().ok()
+    }
+
+    /// `GET path`, whatever bytes it is made of, with what the answer says of itself under `header`.
+    pub fn download(&self, path: &str, header: &str) -> Option<(Vec<u8>, String)> {
+        let url = format!("http://{}{path}", self.http.as_ref()?);
+        let mut answer = ureq::get(&url).call().ok()?;
+        let told = answer.headers().get(header)?.to_str().ok()?.to_owned();
+        Some((answer.body_mut().read_to_vec().ok()?, told))
+    }
+
+    /// Where its configuration lies, and what it keeps.
+    pub fn folder(&self) -> &Path {
+        self.folder.path()
     }
 
     /// `GET path` as JSON.

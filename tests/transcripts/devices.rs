@@ -7,7 +7,7 @@ use busker::engine::device::{
 use busker::engine::profile::Library;
 use busker::engine::settings::{
     Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password,
-    Settings, Wanted,
+    Recorder, Settings, Wanted,
 };
 use busker::engine::time::Duration;
 use busker::engine::units::Release;
@@ -16,7 +16,7 @@ use busker::engine::yaml::Scalar;
 
 /// Reads the header: `device …` lines, `setting DEVICE POINT VALUE` with `enforced` behind it perhaps,
 /// `raw-write DEVICE SPAN`,
-/// and `tcp`, `discovery` or `stop feeding` by themselves.
+/// and `tcp`, `discovery`, `recorder` (which saves files on errors) or `stop feeding` by themselves.
 pub fn settings(header: &str) -> Settings {
     let mut devices = Vec::new();
     for line in header.lines() {
@@ -72,6 +72,11 @@ pub fn settings(header: &str) -> Settings {
         eeprom: Eeprom {
             interval: Duration::from_secs(60),
             daily: if says("small budget") { 4 } else { 500 },
+        },
+        recorder: Recorder {
+            bytes: 32 * 1024,
+            on_error: says("recorder").then_some(Duration::from_secs(900)),
+            keep: 10,
         },
         buses: vec![Bus {
             name: "basement".into(),

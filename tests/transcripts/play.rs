@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use busker::engine::address::{Span, Table};
-use busker::engine::bus::{Action, Bus, Command, Event, Severity};
+use busker::engine::bus::{Action, Bus, Command, Event, Saved, Severity};
 use busker::engine::memory::{Memories, Memory, Record};
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
 use busker::engine::profile::Library;
+use busker::engine::recorder::Entry;
 use busker::engine::request::{Decision, Desk};
 use busker::engine::time::{Date, Duration, Time};
 
@@ -242,6 +243,14 @@ impl Player {
                         refused.iter().map(|span| format!(" {span}")).collect::<String>(),
                     ));
                     self.memories.devices.insert(device, memory);
+                }
+                Action::Record { recording, request } => {
+                    self.write(&format!("record {}", recording.why));
+                    // Nothing is sent here; of each request only its end is on the tape.
+                    let frames =
+                        recording.entries().filter(|(_, entry)| matches!(entry, Entry::Ended(_))).count();
+                    let saved = Saved { path: "FILE".into(), frames, why: recording.why };
+                    self.bus.handle(self.now, Event::Recorded(request, Ok(saved)));
                 }
                 Action::Reopen { after } => self.write(&format!("reopen after {} ms", after.as_millis())),
                 Action::Say(severity, text) => {

@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use axum::body::Body;
-use axum::extract::State;
+use axum::extract::{Path, State};
 use axum::http::{HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
@@ -20,8 +20,9 @@ use tokio::task::JoinHandle;
 
 use crate::edge::clock::Clock;
 use crate::edge::metrics;
-use crate::edge::reports::{Detail, Reporter};
+use crate::edge::reports::{Detail, NoRecording, Reporter};
 use crate::engine::health::Status;
+use crate::engine::recorder::files;
 use door::Door;
 use events::Hub;
 use patience::PatientListener;
@@ -58,6 +59,7 @@ impl Http {
             .route("/metrics", get(metrics))
             .route("/api/devices", get(devices))
             .route("/api/buses", get(buses))
+            .route("/api/buses/{bus}/frames.pcapng", get(frames))
             .route("/api/events", get(events))
             .with_state(Shared { reporter, clock, hub })
             .layer(middleware::from_fn_with_state(Arc::new(Door::new(token)), door::pass));
@@ -118,6 +120,30 @@ async fn devices(State(shared): State<Shared>) -> Response {
 
 async fn buses(State(shared): State<Shared>) -> Response {
     Json(shared.reporter.report(Detail::Devices).await.buses_json()).into_response()
+}
+
+/// What was last on the wire of a bus, as a file for Wireshark.
+async fn frames(State(shared): State<Shared>, Path(bus): Path<String>) -> Response {
+    let recording = match shared.reporter.recording(&bus).await {
+        Ok(recording) => recording,
+        Err(NoRecording::NoSuchBus) => {
+            return (StatusCode::NOT_FOUND, "there is no such bus; /api/buses lists them\n").into_response();
+        }
+        Err(NoRecording::Off) => {
+            let reason = "nothing is recorded; the configuration says `kilobytes: 0` under `recorder`\n";
+            return (StatusCode::NOT_FOUND, reason).into_response();
+        }
+        Err(NoRecording::Stuck) => {
+            return (StatusCode::SERVICE_UNAVAILABLE, "the bus does not answer\n").into_response();
+        }
+    };
+    let (file, _) = recording.to_pcapng(shared.clock.since_1970_at(recording.made_at));
+    let name = files::name(&recording.bus, shared.clock.today(), &[]);
+    let headers = [
+        (header::CONTENT_TYPE, "application/x-pcapng".to_string()),
+        (header::CONTENT_DISPOSITION, format!("attachment; filename=\"{name}\"")),
+    ];
+    (headers, file).into_response()
 }
 
 async fn events(State(shared): State<Shared>) -> Response {

@@ -9,6 +9,7 @@ mod device;
 mod fetch;
 mod load;
 mod pause;
+mod recording;
 mod requests;
 mod turns;
 mod waiting;
@@ -22,6 +23,7 @@ use crate::engine::homeassistant::Gateway;
 use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Cost;
+use crate::engine::recorder::Recording;
 use crate::engine::request;
 use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settings};
 use crate::engine::time::{Duration, Time};
@@ -31,6 +33,8 @@ use commands::{Active, Settling};
 use device::{DeviceState, Turn};
 use fetch::Fetch;
 use load::Load;
+use recording::Recorder;
+pub use recording::Saved;
 use requests::Requests;
 use waiting::{Target, WaitingCommands};
 
@@ -58,6 +62,8 @@ pub enum Event {
     Adopt(Vec<DeviceSettings>, Memories),
     /// The request of the last [`Action::Send`] was taken back before it was on the wire.
     Withdrawn,
+    /// The recording of an [`Action::Record`] is in a file, or why not.
+    Recorded(Option<request::Request>, Result<Saved, String>),
     BrokerUp,
     BrokerDown,
     /// The time of [`Bus::wake_at`] has come.
@@ -90,6 +96,11 @@ pub enum Action {
     Publish(Message),
     /// Keep this for the next start.
     Store(Record),
+    /// Make a file of this, and say [`Event::Recorded`] with the request that asked for it.
+    Record {
+        recording: Box<Recording>,
+        request: Option<request::Request>,
+    },
     /// Close the link, if it is open, and open it after this long. The first action of all.
     Reopen {
         after: Duration,
@@ -137,6 +148,7 @@ pub struct Bus {
     counters: Counters,
     load: Load,
     stopping: bool,
+    recorder: Recorder,
     /// When something is to be stored next.
     record_due_at: Option<Time>,
     /// Whether any device has heartbeats or a watchdog, and settings. Most have none, and with many devices looking for
@@ -257,6 +269,7 @@ impl Bus {
             counters,
             load: Load::default(),
             stopping: false,
+            recorder: Recorder::new(settings.recorder),
             record_due_at,
             feeds,
             has_settings,
@@ -280,6 +293,7 @@ impl Bus {
             Event::Request(request) => self.request(request),
             Event::Retire(device) => self.retire(&device),
             Event::Adopt(devices, memories) => self.adopt(devices, &memories),
+            Event::Recorded(request, result) => self.recorded(request, result),
             Event::BrokerUp => self.broker_up = true,
             Event::BrokerDown => self.broker_up = false,
             Event::Wake => {}
@@ -295,6 +309,7 @@ impl Bus {
         }
         self.end_refreshes();
         self.remember();
+        self.save_trouble();
     }
 
     /// Takes the next thing to do, until there is none.
@@ -305,7 +320,7 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let records = self.record_due_at.into_iter();
+        let records = self.record_due_at.into_iter().chain(self.recorder.due_at());
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
             return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
         }
@@ -371,6 +386,7 @@ impl Bus {
     fn link_up(&mut self) {
         let delays = self.devices.iter().map(|device| device.device().wire.connect_delay);
         self.silent_until = self.now + delays.max().unwrap_or_default();
+        self.record_note("the link is up");
         match std::mem::replace(&mut self.link_state, LinkState::Up) {
             // The devices are as silent as they were, and are asked as seldom.
             LinkState::Renewing => return,
@@ -393,7 +409,12 @@ impl Bus {
             LinkState::Down { attempts, .. } => *attempts,
         };
         if attempts == 0 {
-            self.context.say(Severity::Warning, format!("bus {}: the link is down: {reason}", self.name));
+            let text = format!("the link is down: {reason}");
+            self.context.say(Severity::Warning, format!("bus {}: {text}", self.name));
+            self.record_note(&text);
+            if self.in_flight.is_some() {
+                self.record_trouble(&text);
+            }
         }
         if let Some(in_flight) = self.in_flight.take() {
             self.request_ended(in_flight, Err(RequestError::Link(reason.clone())));
@@ -420,6 +441,7 @@ impl Bus {
     fn reply(&mut self, reply: Reply) {
         let Some(in_flight) = self.in_flight.take() else { return };
         self.count_turn(&in_flight);
+        self.record_reply(in_flight.device, &reply);
         self.counters.count_result(&reply.result);
         self.counters.count_discarded(reply.discarded);
         self.load.add(in_flight.sent_at.max(reply.sent_at), self.now);

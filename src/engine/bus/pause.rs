@@ -44,6 +44,7 @@ impl Bus {
         };
         let reason = format!("paused until {until}");
         self.context.say(Severity::Info, format!("bus {}: {reason}", self.name));
+        self.record_note(&reason);
         self.leave_link(&reason);
         self.link_state = LinkState::Paused { reason };
         self.context.actions.push_back(Action::Reopen { after: time });

@@ -148,6 +148,7 @@ impl Bus {
             Wish::Refresh { device, point } => self.refresh(request, &device, point.as_deref()),
             Wish::Scan(scan) => self.scan(request, &scan),
             Wish::Pause { time, .. } => self.pause(request, time),
+            Wish::Record => self.record(request),
         }
     }
 

@@ -37,6 +37,8 @@ record! {
         on_broker_loss: Part<OnBrokerLoss> = Part::of(OnBrokerLoss::Keep),
         /// How often what is kept in EEPROM may be written, for it wears out.
         eeprom: Option<Part<Eeprom>>,
+        /// The flight recorder: what was last on the wire of each bus.
+        recorder: Option<Part<Recorder>>,
         /// Folders with profiles beside the shipped ones; a profile there wins.
         profiles: Part<Vec<At<String>>> = Part::of(Vec::new()),
         /// Serial lines and TCP connections, by name.
@@ -117,6 +119,20 @@ record! {
         interval: At<Duration> = At::nowhere(Duration::from_secs(60)),
         /// All points of a device together not more often in 24 hours; then commands are refused.
         daily: At<u16> = At::nowhere(500),
+    }
+}
+
+record! {
+    /// The flight recorder: what was last on the wire of each bus.
+    pub struct Recorder {
+        /// So many kilobytes are kept in memory for each bus; 0: nothing.
+        kilobytes: At<u16> = At::nowhere(32),
+        /// Whether they are saved when something goes wrong on the bus, and not only on request.
+        on_error: bool = true,
+        /// Then not more often than once in this time, and less often while it goes on going wrong.
+        interval: At<Duration> = At::nowhere(Duration::from_secs(900)),
+        /// So many files are kept of each bus; an older one goes.
+        keep: At<u16> = At::nowhere(10),
     }
 }
 

@@ -19,7 +19,7 @@ use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
     Bus, ClientCertificate, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password,
-    Settings, Tls, Wanted,
+    Recorder, Settings, Tls, Wanted,
 };
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
@@ -99,6 +99,9 @@ pub fn schema() -> Json {
     schema_of::<Configuration>("busker configuration")
 }
 
+/// A longer tape than this is a capture, which is another program's job.
+const RECORDER_KILOBYTES_MAX: u16 = 4096;
+
 struct Resolver<'a> {
     library: &'a Library,
     faults: Faults,
@@ -123,6 +126,7 @@ impl Resolver<'_> {
         self.release = home_assistant.as_ref().map_or(Release::USUAL, |section| section.minimum_version);
         let mqtt = section(&file.mqtt).map(|mqtt| self.mqtt(&mqtt));
         let eeprom = section(&file.eeprom).map(|eeprom| self.eeprom(&eeprom));
+        let recorder = section(&file.recorder).map(|recorder| self.recorder(&recorder));
         let http = section(&file.http).map(|http| self.http(&http));
         let buses = self.buses(file);
         let devices = self.devices(file);
@@ -135,6 +139,7 @@ impl Resolver<'_> {
             republish: file.republish.get()?.value,
             on_broker_loss: *file.on_broker_loss.get()?,
             eeprom: eeprom?,
+            recorder: recorder?,
             buses,
             devices,
         })
@@ -170,6 +175,28 @@ impl Resolver<'_> {
             self.faults.add(&file.daily.place, "no writes at all; expected at least 1 a day");
         }
         Eeprom { interval: file.interval.value, daily: file.daily.value.into() }
+    }
+
+    fn recorder(&mut self, file: &file::Recorder) -> Recorder {
+        self.within(Some(&file.interval), Duration::from_secs(60), Duration::from_secs(86_400));
+        let kilobytes = file.kilobytes.value;
+        if kilobytes > RECORDER_KILOBYTES_MAX {
+            let place = &file.kilobytes.place;
+            let message = format!(
+                "{kilobytes} is too much for a tape in memory; expected at most {RECORDER_KILOBYTES_MAX}, or 0 for none"
+            );
+            self.faults.add(place, message);
+        }
+        if file.keep.value == 0 {
+            let message =
+                "no file at all; expected at least 1, or `kilobytes: 0` where nothing shall be recorded";
+            self.faults.add(&file.keep.place, message);
+        }
+        Recorder {
+            bytes: usize::from(kilobytes) * 1024,
+            on_error: (file.on_error && kilobytes > 0).then_some(file.interval.value),
+            keep: file.keep.value.into(),
+        }
     }
 
     fn tls(&mut self, file: &file::Mqtt) -> Option<Tls> {

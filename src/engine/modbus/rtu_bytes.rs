@@ -126,7 +126,7 @@ pub fn late_reply(bytes: &[u8], unanswered: &[Unanswered], found: &[usize]) -> O
 }
 
 /// The length of a frame with a right checksum at the beginning of `bytes`.
-fn foreign_frame(bytes: &[u8]) -> Option<usize> {
+pub fn foreign_frame(bytes: &[u8]) -> Option<usize> {
     let valid = |length: usize| length >= FRAME_MIN && length <= bytes.len() && crc(&bytes[..length]) == 0;
     let known = pdu::foreign_lengths(bytes.get(1..)?).map(|length| length + 3).find(|length| valid(*length));
     // A function that is not known here: only the end of the bytes tells where it ends.
