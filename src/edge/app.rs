@@ -1,11 +1,10 @@
-//! Starts what runs and ends it in order: one thread per bus, and a small runtime for the broker and
+//! Starts what runs and ends it in order: the threads of the buses, and a small runtime for the broker and
 //! HTTP.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use anyhow::Context;
-use tokio::runtime::Runtime;
 use tokio::task::JoinHandle;
 
 use crate::edge::bus_thread::{BusHandle, Threads};
@@ -15,6 +14,7 @@ use crate::edge::http::Http;
 use crate::edge::mqtt::{Broker, Mailbox};
 use crate::edge::plant::Plant;
 use crate::edge::reports::{Detail, Reporter, Watched};
+use crate::edge::runtime::Runtime;
 use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
@@ -76,13 +76,7 @@ impl App {
     /// knows devices. An error means that nothing is left running.
     pub fn start(settings: Settings, library: Library, state: StateFiles) -> anyhow::Result<App> {
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
-        // One worker: a second one finds something to do so seldom that waking it costs more than it saves.
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
-            .thread_name("edge")
-            .enable_all()
-            .build()
-            .context("the runtime cannot be started")?;
+        let runtime = Runtime::start().context("the runtime cannot be started")?;
         let clock = Clock::start();
         let state = Arc::new(state);
         // What can fail comes before what cannot.
@@ -139,8 +133,7 @@ impl App {
         if let Some(http) = self.http {
             http.stop();
         }
-        // A stuck bus's thread is not waited for again.
-        self.runtime.shutdown_background();
+        drop(self.runtime);
         self.state.finish();
     }
 }
@@ -255,7 +248,7 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
     let mut responding = true;
     for round in 0u128.. {
         ticks.tick().await;
-        // All are asked, so that none is asked for nothing the next time.
+        // All are looked at, so that none is asked for nothing the next time.
         let stirred = plant.buses().iter().filter(|bus| bus.take_stirred()).count() > 0;
         let broker = plant.broker();
         let others = (broker.connected, broker.client_id_taken, reporter.configuration_error());

@@ -1,5 +1,7 @@
 //! A bus's thread and its handle, on a pseudo-terminal whose far end the test holds.
 
+use std::io::{Read, Write};
+use std::net::TcpListener;
 use std::os::fd::OwnedFd;
 use std::sync::mpsc::{Receiver, channel};
 
@@ -137,6 +139,95 @@ fn what_does_not_fit_into_the_inbox_is_refused_and_not_waited_for() {
     assert_eq!(bus.send(Event::BrokerUp), Err(Full));
     assert!(bus.inspect(|_, _| ()).blocking_recv().is_err(), "a question is refused as well");
     drop(held);
+    bus.shutdown();
+    bus.join();
+}
+
+/// Answers `input 0` with 7 until the connection is closed.
+fn serve(listener: TcpListener) {
+    let (mut stream, _) = listener.accept().expect("the bus connects");
+    let mut request = [0; 12];
+    while stream.read_exact(&mut request).is_ok() {
+        let reply = [&request[..4], &[0, 5, request[6], 4, 2, 0, 7]].concat();
+        if stream.write_all(&reply).is_err() {
+            return;
+        }
+    }
+}
+
+#[test]
+fn connections_share_a_thread_and_end_one_by_one() {
+    let mut text = String::from("home_assistant: {discovery: false}\nbuses:\n");
+    let mut devices = String::from("devices:\n");
+    for name in ["one", "two", "three"] {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+        text +=
+            &format!("  {name}: {{tcp: \"127.0.0.1:{}\"}}\n", listener.local_addr().expect("bound").port());
+        devices += &format!(
+            "  {name}: {{bus: {name}, unit: 1, poll: {{fast: 1ms}}, points: {{a: {{at: input 0, poll: fast}}}}}}\n"
+        );
+        std::thread::spawn(move || serve(listener));
+    }
+    let text = text + &devices;
+    let loaded = configuration::load("busker.yaml", text.as_bytes(), &Library::shipped());
+    let settings = Arc::new(loaded.expect("a good configuration").0);
+    let threads = Threads::default();
+    let mut buses = Vec::new();
+    let (told_on, thread_of) = channel();
+    for index in 0..3 {
+        let (sender, messages) = channel();
+        let told_on = told_on.clone();
+        let publish = move |message| {
+            let _ = told_on.send(std::thread::current().id());
+            drop(sender.send(message));
+        };
+        let bus = threads
+            .start(settings.clone(), index, Clock::start(), nowhere(), Box::new(publish))
+            .expect("a thread");
+        buses.push((bus, messages));
+    }
+    for (name, (_, messages)) in ["one", "two", "three"].iter().zip(&buses) {
+        wait_for(messages, &format!("busker/{name}/a"), "7");
+    }
+    let ids: Vec<std::thread::ThreadId> = thread_of.try_iter().collect();
+    assert!(ids.iter().all(|id| *id == ids[0] && *id != std::thread::current().id()));
+    // Two end, in another order than they began; the third goes on, also when nobody can start another.
+    drop(threads);
+    for (bus, messages) in [buses.remove(1), buses.remove(0)] {
+        bus.shutdown();
+        bus.join();
+        assert!(messages.iter().any(|message| message.payload == "offline"));
+        assert!(bus.inspect(|_, _| ()).blocking_recv().is_err(), "it has ended");
+    }
+    let (last, _) = &buses[0];
+    let requests = || last.inspect(|bus, now| bus.summary(now).counters.requests).blocking_recv();
+    let before = requests().expect("it goes on");
+    let clock = Clock::start();
+    while requests().expect("it goes on") <= before {
+        assert!(clock.now() < Time(0) + PATIENCE, "nothing is read any more");
+    }
+    last.shutdown();
+    last.join();
+}
+
+#[test]
+fn a_bus_is_stirred_by_what_happens_to_devices_and_not_by_what_they_tell() {
+    let (far, path) = line();
+    let (bus, messages) = run(settings(&path, "30s"));
+    hear_request(&far);
+    answer(&far, 21);
+    wait_for(&messages, "busker/one/availability", "online");
+    // What else comes with it is told by now.
+    bus.inspect(|_, _| ()).blocking_recv().expect("the thread lives");
+    assert!(bus.take_stirred());
+    hear_request(&far);
+    answer(&far, 22);
+    wait_for(&messages, "busker/one/a", "22");
+    bus.inspect(|_, _| ()).blocking_recv().expect("the thread lives");
+    assert!(!bus.take_stirred());
+    drop(far);
+    wait_for(&messages, "busker/one/availability", "offline");
+    assert!(bus.take_stirred());
     bus.shutdown();
     bus.join();
 }

@@ -15,6 +15,7 @@ pub mod plant;
 pub mod punctual;
 pub mod reload;
 pub mod reports;
+pub mod runtime;
 pub mod secrets;
 pub mod shutdown;
 pub mod state_files;

@@ -34,7 +34,7 @@ impl World {
 
 /// What changes at a device in this second.
 fn changes(id: &str, second: u64) -> Vec<String> {
-    let wave = |period: f64| (second as f64 / period * TAU).sin();
+    let wave = |period: f64| libm::sin(second as f64 / period * TAU);
     // A room with a little life in it.
     let celsius = 21.0 + 2.0 * wave(120.0);
     match id {

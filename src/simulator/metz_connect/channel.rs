@@ -213,7 +213,8 @@ fn table_points(table: &[u16]) -> Vec<(f64, f64)> {
 /// The temperature at `measured`. The manual speaks only of what lies between points; outside them
 /// the nearest point's temperature is told.
 fn interpolate(points: &[(f64, f64)], measured: f64, exponential: bool) -> f64 {
-    let scale = |quantity: f64| if exponential { quantity.max(f64::MIN_POSITIVE).ln() } else { quantity };
+    let scale =
+        |quantity: f64| if exponential { libm::log(quantity.max(f64::MIN_POSITIVE)) } else { quantity };
     let between = points.windows(2).find(|pair| {
         let (a, b) = (pair[0].1, pair[1].1);
         a.min(b) <= measured && measured <= a.max(b) && a != b
@@ -274,7 +275,7 @@ mod tests {
         for (measured, linear, exponential) in [
             (1000.0, 0.0, 0.0),
             (2000.0, 10.0 / 3.0, 5.0),
-            (10_000.0, 15.0, 10.0 + 10.0 * (2.5f64.ln() / 4f64.ln())),
+            (10_000.0, 15.0, 10.0 + 10.0 * (libm::log(2.5) / libm::log(4.0))),
             (16_000.0, 20.0, 20.0),
             (20_000.0, 20.0, 20.0),
             (10.0, 0.0, 0.0),

@@ -110,9 +110,9 @@ impl Sensor {
             Curve::Kty81(at_25, bend, power) => {
                 let d = t - 25.0;
                 let above = (t - 100.0).max(0.0);
-                at_25 * (1.0 + 7.874e-3 * d + 1.874e-5 * d * d - bend * above.powf(power))
+                at_25 * (1.0 + 7.874e-3 * d + 1.874e-5 * d * d - bend * libm::pow(above, power))
             }
-            Curve::Ntc(at_25, b) => at_25 * (b / (t + 273.15) - b / 298.15).exp(),
+            Curve::Ntc(at_25, b) => at_25 * libm::exp(b / (t + 273.15) - b / 298.15),
             Curve::Lm235 => (t + 273.15) / 100.0,
         }
     }

@@ -6,7 +6,7 @@
 
 /// hPa of saturated vapour.
 fn saturation(celsius: f64) -> f64 {
-    6.112 * (17.62 * celsius / (243.12 + celsius)).exp()
+    6.112 * libm::exp(17.62 * celsius / (243.12 + celsius))
 }
 
 /// hPa of the vapour that is there; `humidity` in percent.
@@ -32,7 +32,7 @@ pub fn dew_point(celsius: f64, humidity: f64) -> f64 {
     if vapour <= 0.0 {
         return f64::NEG_INFINITY;
     }
-    let logarithm = (vapour / 6.112).ln();
+    let logarithm = libm::log(vapour / 6.112);
     243.12 * logarithm / (17.62 - logarithm)
 }
 
@@ -54,7 +54,7 @@ pub fn wet_bulb(celsius: f64, humidity: f64, millibars: f64) -> f64 {
 
 /// mbar at sea level, by the height of the place in metres.
 pub fn at_sea_level(millibars: f64, metres: f64) -> f64 {
-    millibars * (1.0 - 0.0065 * metres / 288.15).powf(-5.255)
+    millibars * libm::pow(1.0 - 0.0065 * metres / 288.15, -5.255)
 }
 
 /// m³/h by a difference of pressures and RWreg_24, the k-factor (pages 10 and 11).

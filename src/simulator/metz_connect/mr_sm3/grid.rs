@@ -81,7 +81,7 @@ impl Phase {
     /// The voltage at one moment, in microseconds.
     pub fn volts_at(&self, micros: f64) -> f64 {
         let turns = micros / 1e6 * self.hertz + self.angle / 360.0;
-        SQRT_2 * self.volts * (TAU * turns.fract()).sin()
+        SQRT_2 * self.volts * libm::sin(TAU * turns.fract())
     }
 
     /// The phase angle has the sign of the reactive power, which is positive for inductive loads. The
@@ -91,7 +91,7 @@ impl Phase {
             return Measured::default();
         }
         let apparent = self.volts * self.amps;
-        let (sine, cosine) = self.lag.to_radians().sin_cos();
+        let (sine, cosine) = libm::sincos(self.lag.to_radians());
         let is_loaded = self.amps > 0.0;
         Measured {
             volts: self.volts,
@@ -121,11 +121,11 @@ pub fn measure_together(phases: &[Phase; PHASES]) -> Together {
     let component = |turn: f64| {
         let (mut real, mut imaginary) = (0.0, 0.0);
         for (number, phase) in phases.iter().enumerate().filter(|(_, phase)| is_measurable(phase)) {
-            let (sine, cosine) = (phase.angle + turn * number as f64).to_radians().sin_cos();
+            let (sine, cosine) = libm::sincos((phase.angle + turn * number as f64).to_radians());
             real += phase.volts * cosine;
             imaginary += phase.volts * sine;
         }
-        tidy(real.hypot(imaginary) / PHASES as f64)
+        tidy(libm::hypot(real, imaginary) / PHASES as f64)
     };
     Together {
         angles: std::array::from_fn(angle),
