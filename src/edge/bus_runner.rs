@@ -11,6 +11,7 @@ use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::{Link, Lost};
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Action, Bus, Event, Severity};
+use crate::engine::health::BusReport;
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::settings::Settings;
@@ -102,6 +103,10 @@ impl BusRunner {
 
     pub(super) fn begin(&mut self) {
         self.perform();
+    }
+
+    pub(super) fn summary(&self) -> BusReport {
+        self.bus.summary(self.clock.now())
     }
 
     pub(super) fn is_finished(&self) -> bool {
