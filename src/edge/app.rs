@@ -18,7 +18,6 @@ use crate::edge::runtime::Runtime;
 use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
-use crate::engine::bus::Bus;
 use crate::engine::health::{self, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
 use crate::engine::profile::Library;
@@ -94,8 +93,7 @@ impl App {
         let _inside = runtime.enter();
         let broker = connect(&plant, secrets, clock);
         let of_reporter = plant.clone();
-        let watched = watched(&plant.settings(), &buses, clock, &state);
-        let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched));
+        let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched(&buses)));
         let http =
             listener.map(|listener| Http::serve(listener, reporter.clone(), clock, keys.token.clone()));
         let watch = tokio::spawn(watch(reporter.clone(), plant.clone()));
@@ -213,15 +211,9 @@ pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock) -> Bro
 }
 
 /// How the buses are asked how they are, and what is told before they have answered.
-pub(super) fn watched(
-    settings: &Settings,
-    buses: &[Arc<BusHandle>],
-    clock: Clock,
-    state: &StateFiles,
-) -> Vec<Arc<Watched>> {
-    let memories = state.memories();
-    let of_bus = |(index, bus): (usize, &Arc<BusHandle>)| {
-        let first = Bus::new(clock.now(), settings, index, &memories).summary(clock.now());
+pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
+    let of_bus = |bus: &Arc<BusHandle>| {
+        let first = bus.first_summary();
         let (bus, of_recording) = (bus.clone(), bus.clone());
         let ask_recording =
             move || of_recording.inspect(|bus, now| bus.recording(now, "on request over HTTP"));
@@ -233,7 +225,7 @@ pub(super) fn watched(
         };
         Arc::new(Watched::new(ask, ask_recording, first))
     };
-    buses.iter().enumerate().map(of_bus).collect()
+    buses.iter().map(of_bus).collect()
 }
 
 /// Looks at the gateway again and again: tells its health, and feeds systemd's watchdog while every

@@ -14,6 +14,7 @@ use crate::edge::link::{Link, Lost};
 use crate::edge::recordings;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Action, Bus, Event, Severity};
+use crate::engine::health::BusReport;
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::recorder::Recording;
@@ -116,6 +117,10 @@ impl BusRunner {
 
     pub(super) fn begin(&mut self) {
         self.perform();
+    }
+
+    pub(super) fn summary(&self) -> BusReport {
+        self.bus.summary(self.clock.now())
     }
 
     pub(super) fn is_finished(&self) -> bool {

@@ -22,6 +22,7 @@ use crate::edge::link::{Lost, timespec};
 use crate::edge::punctual::Punctual;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::{Bus, Event};
+use crate::engine::health::BusReport;
 use crate::engine::settings::{Link, Settings};
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
@@ -32,6 +33,7 @@ pub struct BusHandle {
     bell: Bell,
     stop: Arc<AtomicBool>,
     stirred: Arc<AtomicBool>,
+    first: BusReport,
     ended: Mutex<Option<Receiver<Saving>>>,
 }
 
@@ -59,6 +61,11 @@ impl BusHandle {
         // What does not fit drops the sender, which the receiver notices.
         let _ = self.post(Letter::Inspect(Box::new(look)));
         receiver
+    }
+
+    /// How the bus was before anything happened, without points.
+    pub fn first_summary(&self) -> BusReport {
+        self.first.clone()
     }
 
     /// Whether anything has happened since this was last asked, but that devices answered as they should.
@@ -123,17 +130,19 @@ impl Threads {
             ended,
         };
         let name = format!("bus-{}", settings.buses[index].name);
-        let runner = move || BusRunner::new(settings, index, clock, state, publish, ears);
+        // Not on the thread: what lives long lies better beside what lives long.
+        let runner = BusRunner::new(settings, index, clock, state, publish, ears);
+        let first = runner.summary();
         match shared {
             Some(shared) => {
-                lock(&shared.arrivals).push(runner());
+                lock(&shared.arrivals).push(runner);
                 shared.bell.ring();
             }
             None => {
-                std::thread::Builder::new().name(name).spawn(move || run_alone(runner()))?;
+                std::thread::Builder::new().name(name).spawn(move || run_alone(runner))?;
             }
         }
-        Ok(BusHandle { letters, bell, stop, stirred, ended: Mutex::new(Some(end)) })
+        Ok(BusHandle { letters, bell, stop, stirred, first, ended: Mutex::new(Some(end)) })
     }
 
     /// The thread for connections, which begins with the first of them.

@@ -101,7 +101,7 @@ impl App {
         self.keys = keys;
         let _inside = self.runtime.enter();
         self.broker = Some(connect(&self.plant, secrets, self.clock));
-        self.reporter.replace(watched(&self.plant.settings(), &buses, self.clock, &self.state));
+        self.reporter.replace(watched(&buses));
         Ok(())
     }
 
@@ -169,7 +169,7 @@ impl App {
             };
             buses.push(bus);
         }
-        let watched = watched(&settings, &buses, self.clock, &self.state);
+        let watched = watched(&buses);
         self.plant.exchange(settings, library, buses);
         self.reporter.replace(watched);
         for (name, fate) in &parts.buses {
