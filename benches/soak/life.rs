@@ -25,7 +25,10 @@ const FAULTS: &[&str] = &[
     "silent",
     "silent,every=2",
     "slow=150ms",
+    "late=500ms,every=2",
+    "late=700ms,every=2",
     "late=700ms,every=3",
+    "late=1s,every=2",
     "late=1s,every=4",
     "late=6s,every=5",
     "dribble=5ms",
@@ -46,9 +49,8 @@ const CALM_BEFORE: Duration = Duration::from_secs(8);
 const CALM_AFTER: Duration = Duration::from_secs(25);
 /// All must be right again so long after the last fault.
 const WELL_WITHIN: Duration = Duration::from_secs(90);
-/// The first part of the life is not looked at for growth, nor more than this of it.
-const WARM_UP: f64 = 0.2;
-const WARM_UP_MAX: f64 = 120.0;
+/// So many seconds, and at most half of the life, the program has to come to its size.
+const WARM_UP: f64 = 120.0;
 
 /// What is to be undone, and when.
 enum Undo {
@@ -158,7 +160,7 @@ impl Life {
                 self.progress((told_at - began_at).as_secs_f64(), seconds);
             }
         }
-        let warm_up = self.since_start(began_at) + (seconds * WARM_UP).min(WARM_UP_MAX);
+        let warm_up = self.since_start(began_at) + (seconds / 2.0).min(WARM_UP);
         let samples: Vec<Sample> =
             std::mem::take(&mut self.samples).into_iter().filter(|sample| sample.at > warm_up).collect();
         self.mend()?;
