@@ -117,8 +117,10 @@ impl Checker {
                     let when =
                         if (index as u64) < skipped { "before what was shown last" } else { "too late" };
                     format!(
-                        "{when}, asked at {}, sent at {}, next request at {:?}",
-                        told.asked_at, told.sent_at, told.next_asked_at
+                        "{when}, asked at {}, sent at {}, next request at {}",
+                        told.asked_at,
+                        told.sent_at,
+                        told.next_asked_at.unwrap_or_default()
                     )
                 })
             })
