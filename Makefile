@@ -3,7 +3,7 @@
 # Appended to PATH, so that nobody's own programs are hidden.
 WITH_MOSQUITTO = tools=$$(scripts/get-mosquitto) && PATH="$$PATH:$$tools"
 
-.PHONY: demo test test-page test-wireshark test-home-assistant lint goldens bench
+.PHONY: demo test test-page test-wireshark test-home-assistant lint goldens bench soak
 
 # The whole program without hardware: simulated devices, a broker, the gateway. Ctrl-C ends it.
 demo:
@@ -43,3 +43,9 @@ bench:
 	@$(WITH_MOSQUITTO) && cargo build --locked --release --bin busker --example bench && \
 		BUSKER_LIBMODBUS_LOOP="$$(scripts/get-libmodbus-loop)" \
 		exec $${CARGO_TARGET_DIR:-target}/release/examples/bench $(if $(QUICK),--quick) $(if $(ROWS),--rows $(ROWS))
+
+# A life of faults in real time, ten minutes of it: `make soak MINUTES=60 SEED=7`. Prints what was seen, and
+# writes target/soak.json.
+soak:
+	@$(WITH_MOSQUITTO) && cargo build --locked --release --bin busker --example soak && \
+		exec $${CARGO_TARGET_DIR:-target}/release/examples/soak $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))

@@ -7,6 +7,7 @@ mod clock;
 mod frames;
 mod machine;
 mod mqtt;
+#[allow(dead_code, reason = "the soak uses the rest")]
 mod program;
 mod report;
 mod rows;

@@ -15,7 +15,7 @@ use crate::machine;
 pub struct Mosquitto {
     child: Child,
     pub port: u16,
-    _folder: TempDir,
+    folder: TempDir,
 }
 
 impl Mosquitto {
@@ -23,30 +23,19 @@ impl Mosquitto {
         let folder = tempfile::tempdir()?;
         for _ in 0..5 {
             let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
-            let path = folder.path().join("mosquitto.conf");
-            // Its own defaults hold back what a subscriber has not taken yet, and then drop it.
-            let text = format!(
-                "listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nlog_dest stderr\n\
-                 set_tcp_nodelay true\nmax_queued_messages 0\nmax_inflight_messages 0\n"
-            );
-            fs::write(&path, text)?;
-            let mut child = Command::new("mosquitto")
-                .arg("-c")
-                .arg(&path)
-                .stdout(Stdio::null())
-                .stderr(Stdio::piped())
-                .spawn()
-                .context("mosquitto cannot be started; `scripts/get-mosquitto` gets it")?;
-            let log = child.stderr.take().context("its log is piped")?;
-            let mut lines = BufReader::new(log).lines().map_while(Result::ok);
-            // Without the port it ends, and so does its log.
-            if lines.any(|line| line.ends_with(" running")) {
-                std::thread::spawn(move || lines.for_each(drop));
-                return Ok(Mosquitto { child, port, _folder: folder });
+            if let Some(child) = launch(&folder, port)? {
+                return Ok(Mosquitto { child, port, folder });
             }
-            let _ = child.wait();
         }
         bail!("mosquitto does not start")
+    }
+
+    /// Kills it with all that it remembers, and starts it again on the same port.
+    pub fn start_anew(&mut self) -> anyhow::Result<()> {
+        self.child.kill()?;
+        self.child.wait()?;
+        self.child = launch(&self.folder, self.port)?.context("mosquitto does not start again")?;
+        Ok(())
     }
 
     pub fn cpu_seconds(&self) -> f64 {
@@ -61,6 +50,33 @@ impl Drop for Mosquitto {
     }
 }
 
+/// `None` if the port is taken.
+fn launch(folder: &TempDir, port: u16) -> anyhow::Result<Option<Child>> {
+    let path = folder.path().join("mosquitto.conf");
+    // Its own defaults hold back what a subscriber has not taken yet, and then drop it.
+    let text = format!(
+        "listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nlog_dest stderr\n\
+         set_tcp_nodelay true\nmax_queued_messages 0\nmax_inflight_messages 0\n"
+    );
+    fs::write(&path, text)?;
+    let mut child = Command::new("mosquitto")
+        .arg("-c")
+        .arg(&path)
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .context("mosquitto cannot be started; `scripts/get-mosquitto` gets it")?;
+    let log = child.stderr.take().context("its log is piped")?;
+    let mut lines = BufReader::new(log).lines().map_while(Result::ok);
+    // Without the port it ends, and so does its log.
+    if lines.any(|line| line.ends_with(" running")) {
+        std::thread::spawn(move || lines.for_each(drop));
+        return Ok(Some(child));
+    }
+    let _ = child.wait();
+    Ok(None)
+}
+
 /// A running gateway.
 pub struct Busker {
     child: Child,
@@ -71,10 +87,15 @@ pub struct Busker {
 impl Busker {
     /// `busker run` with this broker and with buses and devices as in `rest`.
     pub fn start(mosquitto: &Mosquitto, rest: &str) -> anyhow::Result<Busker> {
+        Busker::start_at(mosquitto.port, rest)
+    }
+
+    /// The same with a broker at a port of this machine.
+    pub fn start_at(port: u16, rest: &str) -> anyhow::Result<Busker> {
         let folder = tempfile::tempdir()?;
         let text = format!(
             "mqtt: {{url: \"mqtt://127.0.0.1:{}\"}}\nhttp: {{listen: \"127.0.0.1:0\"}}\nstate_dir: {}\n{rest}",
-            mosquitto.port,
+            port,
             folder.path().display(),
         );
         let path = folder.path().join("busker.yaml");
@@ -92,6 +113,21 @@ impl Busker {
         Ok(Busker { child, started_at, folder })
     }
 
+    /// The number of its process.
+    pub fn process(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// What it has said.
+    pub fn log(&self) -> String {
+        fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
+    }
+
+    /// Whether it still runs.
+    pub fn runs(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
     pub fn cpu_seconds(&self) -> f64 {
         machine::cpu_seconds(self.child.id())
     }
@@ -101,14 +137,27 @@ impl Busker {
         machine::resident(self.child.id())
     }
 
+    /// Waits until it has told where it serves HTTP: `127.0.0.1:…`.
+    pub fn http(&mut self) -> anyhow::Result<String> {
+        let log = self.folder.path().join("log");
+        let mut address = String::new();
+        self.wait(20.0, "the address of HTTP", || {
+            let text = fs::read_to_string(&log).unwrap_or_default();
+            let behind = text.split_once("HTTP on http://").map(|(_, behind)| behind.to_owned());
+            address =
+                behind.and_then(|behind| Some(behind.split_once('/')?.0.to_owned())).unwrap_or_default();
+            !address.is_empty()
+        })?;
+        Ok(address)
+    }
+
     /// Looks until `done`; fails with what the program said when that takes too long.
     pub fn wait(&mut self, seconds: f64, what: &str, mut done: impl FnMut() -> bool) -> anyhow::Result<()> {
         let began_at = now();
         while !done() {
             let ended = self.child.try_wait()?.is_some();
             if ended || seconds_since(began_at) > seconds {
-                let log = fs::read_to_string(self.folder.path().join("log")).unwrap_or_default();
-                bail!("waited in vain for {what}; the program said:\n{log}");
+                bail!("waited in vain for {what}; the program said:\n{}", self.log());
             }
             crate::clock::sleep(std::time::Duration::from_millis(2));
         }
@@ -129,7 +178,7 @@ pub fn program() -> anyhow::Result<PathBuf> {
     let folder = own.parent().and_then(Path::parent).context("the benchmark is in a folder")?;
     let program = folder.join("busker");
     if !program.exists() {
-        bail!("`{}` is not there; `make bench` builds it", program.display());
+        bail!("`{}` is not there; `make bench` and `make soak` build it", program.display());
     }
     Ok(program)
 }
