@@ -535,7 +535,7 @@ def every_thing(house: House) -> None:
 
 def bring_to_life(house: House, device: Device, thing: dict) -> Announced:
     key = f"{device.identity}_{thing['name']}"
-    wishes = dict(thing["when"])
+    wishes = dict(thing["when"] or {})
     if thing["as"] == "climate":
         wishes |= degrees(device, thing["temperature"]) | degrees(device, thing["target"])
     for point, values in wishes.items():
