@@ -18,6 +18,8 @@ import time
 import paho.mqtt.client as mqtt
 
 PATIENCE = 30  # seconds until something that must happen has failed
+# Profiles of the test's own, for what no shipped one has.
+OWN_PROFILES = pathlib.Path(__file__).parent / "profiles"
 
 
 class Fault(Exception):
@@ -34,10 +36,10 @@ class Busker:
         return subprocess.run([self.program, *arguments], check=True, stdout=subprocess.PIPE, text=True).stdout
 
     def profiles(self) -> list[dict]:
-        return json.loads(self.tell("profiles", "list", "--json"))
+        return json.loads(self.tell("profiles", "list", "--profiles", str(OWN_PROFILES), "--json"))
 
     def profile(self, profile: str) -> dict:
-        return json.loads(self.tell("profiles", "show", profile, "--json"))
+        return json.loads(self.tell("profiles", "show", "--profiles", str(OWN_PROFILES), profile, "--json"))
 
     def simulated(self) -> list[str]:
         """The models that there is a simulator for."""
@@ -125,17 +127,50 @@ class Line:
 
 
 def plant(busker: Busker, folder: pathlib.Path, ending: contextlib.ExitStack) -> list[Device]:
-    """A device of every profile that has a simulator, dealt out to three lines."""
+    """A device of every profile that has a simulator, and of the test's own, dealt out to three lines."""
     simulated = set(busker.simulated())
-    profiles = [about for about in busker.profiles() if about["device"] in simulated]
+    profiles = [about for about in busker.profiles() if about["device"] in simulated or is_own(about)]
     ways_in = {"cellar": "pty", "attic": "rtu_over_tcp", "hall": "tcp"}
     devices = []
     for number, (name, way_in) in enumerate(ways_in.items()):
-        abouts = profiles[number :: len(ways_in)]
-        units = [f"{about['device']}@{unit}" for unit, about in enumerate(abouts, 1)]
-        line = Line(name, way_in, units, folder, busker, ending)
-        devices += [Device(about, busker.profile(about["device"]), line, unit) for unit, about in enumerate(abouts, 1)]
+        devices += connected(profiles[number :: len(ways_in)], name, way_in, folder, busker, ending)
     return sorted(devices, key=lambda device: device.profile)
+
+
+def large_plant(busker: Busker, folder: pathlib.Path, ending: contextlib.ExitStack) -> list[Device]:
+    """Devices with 3,000 points and more, on four Modbus TCP connections."""
+    simulated = set(busker.simulated())
+    profiles = [about for about in busker.profiles() if about["device"] in simulated]
+    kinds = [(about, len(busker.profile(about["device"])["points"])) for about in profiles]
+    lines = {name: [] for name in ("north", "east", "south", "west")}
+    points = 0
+    while points < 3000:
+        for about, count in kinds:
+            min(lines.values(), key=len).append(about)
+            points += count
+    devices = []
+    for name, abouts in lines.items():
+        for device in connected(abouts, name, "tcp", folder, busker, ending):
+            # There are several of each profile.
+            device.name = f"{name}_{device.unit}_{device.name}"
+            device.title = f"{device.title} {name} {device.unit}"
+            device.identity = f"busker_{device.name}"
+            devices.append(device)
+    return devices
+
+
+def connected(abouts: list[dict], name: str, way_in: str, folder: pathlib.Path, busker: Busker, ending) -> list[Device]:
+    """Devices of these profiles on one line, with units from 1 on."""
+    units = []
+    for unit, about in enumerate(abouts, 1):
+        path = f"{OWN_PROFILES}/{about['device']}.yaml"
+        units += ["--profile", f"{path}@{unit}"] if is_own(about) else [f"{about['device']}@{unit}"]
+    line = Line(name, way_in, units, folder, busker, ending)
+    return [Device(about, busker.profile(about["device"]), line, unit) for unit, about in enumerate(abouts, 1)]
+
+
+def is_own(about: dict) -> bool:
+    return (OWN_PROFILES / f"{about['device']}.yaml").exists()
 
 
 class Gateway:
@@ -153,6 +188,7 @@ class Gateway:
         settings = {
             "mqtt": {"url": f"mqtt://127.0.0.1:{self.broker.port}"},
             "http": {"listen": None},
+            "profiles": [str(OWN_PROFILES)],
             "state_dir": f"{self.folder}/state",
             **self.wishes,
             "buses": buses,
