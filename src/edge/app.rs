@@ -234,6 +234,7 @@ pub(super) fn watched(
             bus.inspect(move |bus, now| match detail {
                 Detail::Devices => bus.summary(now),
                 Detail::Points => bus.report(now),
+                Detail::Readings => bus.readings(now),
             })
         };
         Arc::new(Watched::new(ask, first))
@@ -274,6 +275,13 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
         if round % rounds_to_tell == 0 || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
+        }
+        // One after the other, so that many devices make no burst; all of them at first.
+        for (number, (bus, device)) in report.devices().enumerate() {
+            if round == 0 || number as u128 % rounds.max(1) == round % rounds.max(1) {
+                let health = device.health_json(&bus.name).to_string();
+                mailbox.push(Message::retained(topics.health(&device.name), health));
+            }
         }
         let info = plant.info(&report);
         if told_info != info {
