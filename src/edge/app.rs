@@ -276,9 +276,8 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
         }
-        // One after the other, so that many devices make no burst; all of them at first.
-        for (number, (bus, device)) in report.devices().enumerate() {
-            if round == 0 || number as u128 % rounds.max(1) == round % rounds.max(1) {
+        if round % rounds_to_tell == 0 {
+            for (bus, device) in report.devices() {
                 let health = device.health_json(&bus.name).to_string();
                 mailbox.push(Message::retained(topics.health(&device.name), health));
             }
