@@ -5,8 +5,10 @@ use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
+use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::clock::{now, seconds_since};
@@ -126,6 +128,25 @@ impl Busker {
     /// Whether it still runs.
     pub fn runs(&mut self) -> bool {
         matches!(self.child.try_wait(), Ok(None))
+    }
+
+    /// What `busker check` says of its configuration, where devices begin their answers after
+    /// `turnaround`; and keeps the file as `target/bench/<name>.yaml`.
+    pub fn check(&self, name: &str, turnaround: Duration) -> anyhow::Result<Value> {
+        let program = program()?;
+        let target = program.parent().and_then(Path::parent).context("a target folder")?;
+        fs::create_dir_all(target.join("bench"))?;
+        let kept = target.join("bench").join(format!("{name}.yaml"));
+        fs::copy(self.folder.path().join("busker.yaml"), &kept)?;
+        let turnaround = format!("{}ms", turnaround.as_secs_f64() * 1e3);
+        let output = Command::new(&program)
+            .args(["check", "--json", "--turnaround", &turnaround, "--config"])
+            .arg(&kept)
+            .output()?;
+        if !output.status.success() {
+            bail!("`busker check` finds faults: {}", String::from_utf8_lossy(&output.stderr));
+        }
+        Ok(serde_json::from_slice(&output.stdout)?)
     }
 
     pub fn cpu_seconds(&self) -> f64 {

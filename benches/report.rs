@@ -23,6 +23,7 @@ pub struct Figure {
 pub enum Target {
     AtMost(f64),
     AtLeast(f64),
+    Between(f64, f64),
     /// Only told.
     None,
 }
@@ -53,6 +54,7 @@ impl Figure {
         let good = match self.target {
             Target::AtMost(bound) => value <= bound,
             Target::AtLeast(bound) => value >= bound,
+            Target::Between(least, most) => (least..=most).contains(&value),
             Target::None => return "",
         };
         match (good, self.noise.is_too_much()) {
@@ -66,6 +68,7 @@ impl Figure {
         match self.target {
             Target::AtMost(bound) => format!("≤ {bound}{}", self.unit),
             Target::AtLeast(bound) => format!("≥ {bound}{}", self.unit),
+            Target::Between(least, most) => format!("{least}–{most}{}", self.unit),
             Target::None => "–".into(),
         }
     }
@@ -84,15 +87,16 @@ impl Figure {
     }
 
     fn json(&self) -> Value {
-        let (kind, bound) = match self.target {
-            Target::AtMost(bound) => ("at_most", Some(bound)),
-            Target::AtLeast(bound) => ("at_least", Some(bound)),
-            Target::None => ("none", None),
+        let target = match self.target {
+            Target::AtMost(bound) => json!({"kind": "at_most", "bound": bound}),
+            Target::AtLeast(bound) => json!({"kind": "at_least", "bound": bound}),
+            Target::Between(least, most) => json!({"kind": "between", "least": least, "most": most}),
+            Target::None => json!({"kind": "none", "bound": null}),
         };
         json!({
             "row": self.row,
             "what": self.what,
-            "target": {"kind": kind, "bound": bound},
+            "target": target,
             "unit": self.unit.trim(),
             "reached": self.value(),
             "runs": self.runs,

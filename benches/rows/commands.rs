@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use anyhow::Context;
+
 use super::saturated::cycles;
 use super::{AT_ONCE, Bench, Configured, REGISTERS, Rig, UNITS, W1_LINE, W1_TURNAROUND, points};
 use crate::clock::{now, sleep};
@@ -81,6 +83,8 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
         .filter(|seen| seen.function == 3 && usize::from(seen.argument) != REGISTERS)
         .count();
 
+    let check = rig.busker.check("W4", W1_TURNAROUND)?;
+    let forecast = check["buses"][0]["command_wait"].as_f64().context("`busker check` tells no wait")?;
     let count = sent.len();
     let late = quantile(&latencies, 0.95).unwrap_or(f64::INFINITY);
     let figures = [
@@ -90,6 +94,9 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
         Figure::new("W4", "command to its first byte, p95", Target::AtMost(36.0), " ms")
             .reached([late])
             .remark(format!("the latest {:.1} ms", greatest(&latencies).unwrap_or_default())),
+        Figure::new("W4", "worst wait as `busker check` says ÷ the latest", Target::None, "")
+            .reached([forecast * 1e3 / greatest(&latencies).unwrap_or(f64::INFINITY)])
+            .remark("beside the wait itself, the latest one took its way through the broker"),
         Figure::new("W4", "commands lost or written twice", Target::AtMost(0.0), "")
             .reached([lost as f64])
             .remark(format!("{done} of {count} outcomes say `done`")),

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use anyhow::Context;
+
 use super::{AT_ONCE, Bench, Configured, REGISTERS, Rig, UNITS, W1_LINE, W1_TURNAROUND, points};
 use crate::clock::sleep;
 use crate::frames::Line;
@@ -13,36 +15,38 @@ const W1: Behaviour =
     Behaviour { line: W1_LINE, turnaround: W1_TURNAROUND, strict: false, counting: false, first_piece: None };
 
 pub fn w1(bench: &mut Bench) -> anyhow::Result<()> {
-    let measured = run(bench, W1, true)?;
+    let measured = run(bench, "W1", W1, true)?;
     let noise = measured.noise;
     let figures = [
         measured.ratio("W1", 1.01),
         measured.violations("W1"),
         Figure::new("W1", "longest wait of a unit, in cycles", Target::AtMost(1.1), "")
             .reached(measured.waits.clone()),
+        measured.forecast("W1"),
     ];
     bench.tell(noise, figures);
     Ok(())
 }
 
 pub fn w1_strict(bench: &mut Bench) -> anyhow::Result<()> {
-    let measured = run(bench, Behaviour { strict: true, ..W1 }, true)?;
+    let measured = run(bench, "W1-strict", Behaviour { strict: true, ..W1 }, true)?;
     let figures = [measured.ratio("W1-strict", 1.01), measured.violations("W1-strict")];
     bench.tell(measured.noise, figures);
     Ok(())
 }
 
 pub fn w2(bench: &mut Bench) -> anyhow::Result<()> {
-    let measured = run(bench, W1, false)?;
-    let figures = [measured.ratio("W2", 1.03), measured.violations("W2")];
+    let measured = run(bench, "W2", W1, false)?;
+    let figures = [measured.ratio("W2", 1.03), measured.violations("W2"), measured.forecast("W2")];
     bench.tell(measured.noise, figures);
     Ok(())
 }
 
 pub fn w8(bench: &mut Bench) -> anyhow::Result<()> {
     let line = Line::new(115_200, "none", 10);
-    let measured = run(bench, Behaviour { line, turnaround: Duration::from_millis(1), ..W1 }, true)?;
-    let figures = [measured.ratio("W8", 1.03), measured.violations("W8")];
+    let behaviour = Behaviour { line, turnaround: Duration::from_millis(1), ..W1 };
+    let measured = run(bench, "W8", behaviour, true)?;
+    let figures = [measured.ratio("W8", 1.03), measured.violations("W8"), measured.forecast("W8")];
     bench.tell(measured.noise, figures);
     Ok(())
 }
@@ -57,8 +61,15 @@ pub fn w7(bench: &mut Bench) -> anyhow::Result<()> {
     let (transactions, noise) = rig.measure(time)?;
     let share = (rig.busker.cpu_seconds() - before) / time.as_secs_f64() * 100.0;
     let resident = rig.busker.resident() / 1e6;
+    let check = rig.busker.check("W7", W1.turnaround)?;
+    let load = check["buses"][0]["load"].as_f64().context("`busker check` tells no load")?;
+    let of_request = W1.line.read(REGISTERS, W1.turnaround) as f64 / 1e9;
+    let busy = transactions.len() as f64 * of_request / time.as_secs_f64();
     let figures =
         [
+            Figure::new("W7", "load as `busker check` says ÷ measured", Target::Between(0.95, 1.05), "")
+                .reached([load / busy])
+                .remark("`target/bench/W7.yaml`"),
             Figure::new("W7", "share of a core", Target::AtMost(0.03), " %")
                 .reached([share])
                 .remark(format!("{} requests in {} s", transactions.len(), time.as_secs())),
@@ -76,6 +87,8 @@ struct Measured {
     waits: Vec<f64>,
     violations: Vec<f64>,
     cpu: Vec<f64>,
+    /// What `busker check` says of the cycle, ÷ the cycle.
+    forecasts: Vec<f64>,
     shortest: f64,
     unheard: usize,
     noise: Noise,
@@ -94,6 +107,13 @@ impl Measured {
             .remark(format!("mean cycle {mean:.4}; {cpu:.2} % of a core{unheard}"))
     }
 
+    /// `busker check` on this row's configuration.
+    fn forecast(&self, row: &'static str) -> Figure {
+        Figure::new(row, "forecast of `busker check` ÷ cycle", Target::Between(0.95, 1.05), "")
+            .reached(self.forecasts.clone())
+            .remark(format!("`target/bench/{row}.yaml`"))
+    }
+
     fn violations(&self, row: &'static str) -> Figure {
         let worst = greatest(&self.violations).unwrap_or_default();
         Figure::new(row, "requests without their silence", Target::AtMost(0.0), "")
@@ -103,7 +123,7 @@ impl Measured {
 }
 
 /// Several runs, each with a program of its own.
-fn run(bench: &Bench, behaviour: Behaviour, gapless: bool) -> anyhow::Result<Measured> {
+fn run(bench: &Bench, row: &'static str, behaviour: Behaviour, gapless: bool) -> anyhow::Result<Measured> {
     let units: Vec<u8> = (1..=UNITS).collect();
     let (points, registers) = points(gapless);
     let optimum = match gapless {
@@ -125,6 +145,10 @@ fn run(bench: &Bench, behaviour: Behaviour, gapless: bool) -> anyhow::Result<Mea
         let cycle = median(&cycles).unwrap_or(f64::INFINITY);
         measured.ratios.push(cycle / minimum);
         measured.means.push(cycles.iter().sum::<f64>() / cycles.len() as f64 / minimum);
+        let check = rig.busker.check(row, behaviour.turnaround)?;
+        let fast = &check["buses"][0]["devices"][0]["polls"]["fast"];
+        let forecast = fast["real_period"].as_f64().context("`busker check` tells no period")?;
+        measured.forecasts.push(forecast * 1e9 / cycle);
         measured.waits.push(longest_wait(&transactions) as f64 / cycle);
         let silence = behaviour.line.silence();
         let spare: Vec<i64> =

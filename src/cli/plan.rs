@@ -9,13 +9,9 @@ use super::output::{print, print_json};
 use super::profiles::load_file;
 use super::{Failure, configuration};
 use crate::engine::device::Device;
-use crate::engine::plan::{self, Cost, Read};
+use crate::engine::plan::{self, Cost, Read, Tariff, USUAL_TURNAROUND};
 use crate::engine::profile::Library;
 use crate::engine::settings::{Line, Link, Parity};
-use crate::engine::time::Duration;
-
-/// Before a device's own latency is measured.
-const TURNAROUND: Duration = Duration::from_millis(5);
 
 /// Show the reads that each device will be asked with
 ///
@@ -80,7 +76,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
 
 fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
-    let cost = Cost::of(&Link::Serial { path: String::new(), line }, TURNAROUND);
+    let cost = Tariff::of(&Link::Serial { path: String::new(), line }, None).cost(USUAL_TURNAROUND);
     if id.ends_with(".yaml") {
         return Ok(plan_of(id, &load_file(Path::new(id))?, cost));
     }
@@ -110,7 +106,8 @@ fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
     Ok(devices
         .into_iter()
         .map(|device| {
-            let cost = Cost::of(&settings.buses[device.bus].link, TURNAROUND);
+            let bus = &settings.buses[device.bus];
+            let cost = Tariff::of(&bus.link, bus.gap).cost(USUAL_TURNAROUND);
             plan_of(&device.name, &device.device, cost)
         })
         .collect())
@@ -125,7 +122,7 @@ fn plan_of(name: &str, device: &Device, cost: Cost) -> DevicePlan {
         last: read.span.last(),
         points: read.points.iter().map(|(point, _)| device.points[*point].name.clone()).collect(),
         sleeps_by: read.sleeps_by(device).iter().map(|point| device.points[*point].name.clone()).collect(),
-        wire_ms: cost.of_read(read.span) as f64 / 1000.0,
+        wire_ms: cost.of_read(read.span) as f64 / 1e6,
     };
     DevicePlan {
         device: name.to_string(),

@@ -258,7 +258,7 @@ fn write(
 }
 
 /// So much a request and a byte cost on a usual line, for reads that nobody times.
-const COST: Cost = Cost { request: 20_000, byte: 573 };
+const COST: Cost = Cost { request: 20_000_000, byte: 573_000 };
 
 /// Reads what is not yet known of `points`, and before it what decides them.
 fn learn(

@@ -221,6 +221,7 @@ pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
             bus.inspect(move |bus, now| match detail {
                 Detail::Devices => bus.summary(now),
                 Detail::Points => bus.report(now),
+                Detail::Readings => bus.readings(now),
             })
         };
         Arc::new(Watched::new(ask, ask_recording, first))
@@ -261,6 +262,12 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
         if round % rounds_to_tell == 0 || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
+        }
+        if round % rounds_to_tell == 0 {
+            for (bus, device) in report.devices() {
+                let health = device.health_json(&bus.name).to_string();
+                mailbox.push(Message::retained(topics.health(&device.name), health));
+            }
         }
         let info = plant.info(&report);
         if told_info != info {

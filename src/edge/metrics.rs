@@ -3,13 +3,18 @@
 use std::fmt;
 use std::sync::atomic::AtomicU64;
 
+use prometheus_client::collector::Collector;
 use prometheus_client::encoding::text::encode;
+use prometheus_client::encoding::{DescriptorEncoder, NoLabelSet};
+use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
-use crate::engine::health::{BusHealth, Counters, GatewayReport};
+use crate::engine::health::{
+    BusHealth, Counters, GatewayReport, Readout, ReadoutValue, SpreadReport, TimingReport,
+};
 
 /// What a scraper is told that it gets.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -19,7 +24,8 @@ type OneGauge = Gauge<f64, AtomicU64>;
 type Gauges = Family<Labels, OneGauge>;
 
 /// The counts live in the report; the library is only asked to write them down.
-pub fn render(report: &GatewayReport) -> Result<String, fmt::Error> {
+pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
+    let readings = Readings::taken_from(&mut report);
     let mut registry = Registry::with_prefix("busker");
     let flag = |on| if on { 1.0 } else { 0.0 };
     let connected = OneGauge::default();
@@ -54,6 +60,9 @@ pub fn render(report: &GatewayReport) -> Result<String, fmt::Error> {
         .map(|bus| (vec![("bus", bus.report.name.clone())], &bus.report.counters))
         .collect();
     wire_counters(&mut registry, "bus", all_buses);
+    let all_buses = || report.buses.iter().map(|bus| (vec![("bus", bus.report.name.clone())], &bus.report));
+    codes(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.counters)));
+    times(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.timing)));
 
     let labels = |bus: &str, device: &str| vec![("bus", bus.to_string()), ("device", device.to_string())];
     let online = report
@@ -64,6 +73,21 @@ pub fn render(report: &GatewayReport) -> Result<String, fmt::Error> {
     let all_devices =
         report.devices().map(|(bus, device)| (labels(&bus.name, &device.name), &device.counters)).collect();
     wire_counters(&mut registry, "device", all_devices);
+    let all_devices = || report.devices().map(|(bus, device)| (labels(&bus.name, &device.name), device));
+    codes(&mut registry, "device", all_devices().map(|(labels, device)| (labels, &device.counters)));
+    times(&mut registry, "device", all_devices().map(|(labels, device)| (labels, &device.timing)));
+    let (mut real, mut wanted) = (Vec::new(), Vec::new());
+    for (labels, device) in all_devices() {
+        for period in &device.periods {
+            let labels = [&labels[..], &[("class", period.class.name().to_string())]].concat();
+            real.extend(period.real.map(|real| (labels.clone(), real.as_secs_f64())));
+            wanted.push((labels, period.wanted.as_secs_f64()));
+        }
+    }
+    let help = "How often the reads of a poll class come round";
+    gauges(&mut registry, "device_period_seconds", help, real);
+    gauges(&mut registry, "device_wanted_period_seconds", "How often they should", wanted);
+    registry.register_collector(Box::new(readings));
 
     let mut text = String::new();
     encode(&mut text, &registry)?;
@@ -103,20 +127,158 @@ fn wire_counters(registry: &mut Registry, of: &str, counted: Vec<(Labels, &Count
     }
 }
 
+/// Exceptions by their codes: only those that there were.
+fn codes<'c>(registry: &mut Registry, of: &str, counted: impl Iterator<Item = (Labels, &'c Counters)>) {
+    let mut values = Vec::new();
+    for (labels, counters) in counted {
+        for (code, count) in counters.exceptions_by_code() {
+            values.push(([&labels[..], &[("code", code)]].concat(), count));
+        }
+    }
+    let help = "exceptions by code since the start";
+    counters(registry, &format!("{of}_exceptions_by_code"), help, values);
+}
+
+/// One histogram for each kind of time that has been seen.
+fn times<'t>(registry: &mut Registry, of: &str, timings: impl Iterator<Item = (Labels, &'t TimingReport)>) {
+    let timings: Vec<(Labels, &TimingReport)> = timings.collect();
+    for (index, (name, _)) in TimingReport::default().list().into_iter().enumerate() {
+        let told = |(labels, timing): &(Labels, &TimingReport)| {
+            Some((labels.clone(), timing.list()[index].1.clone()?))
+        };
+        let values = timings.iter().filter_map(told).collect();
+        let help = match name {
+            "turnaround" => "From a read's last character to the first one of its answer.",
+            "gap_wait" => "From the decision on a request until it was on the wire.",
+            "lateness" => "How much of that the silence before a request did not ask for.",
+            _ => "From a command's arrival until it was on the wire.",
+        };
+        let name = format!("{of}_{name}_seconds");
+        registry.register_collector(Box::new(Histograms { name, help, values }));
+    }
+}
+
+/// What has been counted already, as histograms.
+#[derive(Debug)]
+struct Histograms {
+    name: String,
+    help: &'static str,
+    values: Vec<(Labels, SpreadReport)>,
+}
+
+impl Collector for Histograms {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), fmt::Error> {
+        if self.values.is_empty() {
+            return Ok(());
+        }
+        let mut family = encoder.encode_descriptor(&self.name, self.help, None, MetricType::Histogram)?;
+        for (labels, spread) in &self.values {
+            let bounds = SpreadReport::bounds().map(|bound| bound.as_secs_f64()).chain([f64::INFINITY]);
+            let buckets: Vec<(f64, u64)> =
+                bounds.zip(spread.counts.iter().map(|count| u64::from(*count))).collect();
+            let count = buckets.iter().map(|(_, count)| count).sum();
+            let mut one = family.encode_family(labels)?;
+            one.encode_histogram::<NoLabelSet>(spread.sum.as_secs_f64(), count, &buckets, None)?;
+        }
+        Ok(())
+    }
+}
+
+/// The readings of all devices that are true now: of what is missing or old there is no line.
+#[derive(Debug)]
+struct Readings(Vec<(String, Vec<Readout>)>);
+
+impl Readings {
+    /// The readings are many: they are not copied.
+    fn taken_from(report: &mut GatewayReport) -> Readings {
+        let devices =
+            report.buses.iter_mut().filter(|bus| bus.responding).flat_map(|bus| &mut bus.report.devices);
+        let online = devices.filter(|device| device.online);
+        Readings(online.map(|device| (device.name.clone(), std::mem::take(&mut device.readings))).collect())
+    }
+
+    fn all(&self) -> impl Iterator<Item = (&str, &Readout)> {
+        self.0
+            .iter()
+            .flat_map(|(device, readings)| readings.iter().map(move |reading| (device.as_str(), reading)))
+    }
+}
+
+impl Collector for Readings {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), fmt::Error> {
+        let help = "What the device holds; a flag is 0 or 1. Absent while it is not known.";
+        let mut family = encoder.encode_descriptor("reading", help, None, MetricType::Gauge)?;
+        for (device, reading) in self.all() {
+            let unit = reading.unit.as_deref().unwrap_or_default();
+            let labels = [("device", device), ("point", &reading.point), ("unit", unit)];
+            match &reading.value {
+                ReadoutValue::Number(value) => family.encode_family(&labels)?.encode_gauge(value)?,
+                ReadoutValue::Numbers(values) => {
+                    for (element, value) in values {
+                        let element = element.to_string();
+                        let [device, point, unit] = labels;
+                        let labels = [device, point, ("element", &element), unit];
+                        family.encode_family(&labels)?.encode_gauge(value)?;
+                    }
+                }
+                ReadoutValue::Name { .. } => {}
+            }
+        }
+        // As a state set: one line for each name, of which one is 1.
+        let help = "Which of its names the point holds. Absent while it is not known.";
+        let mut family = encoder.encode_descriptor("reading_state", help, None, MetricType::Gauge)?;
+        for (device, reading) in self.all() {
+            let ReadoutValue::Name { holds, names } = &reading.value else { continue };
+            for name in names {
+                let value = if name == holds { 1.0 } else { 0.0 };
+                let labels = [("device", device), ("point", &reading.point), ("state", name)];
+                family.encode_family(&labels)?.encode_gauge(&value)?;
+            }
+        }
+        Ok(())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::health::{BrokerReport, BusReport, DeviceReport};
+    use crate::engine::device::Poll;
+    use crate::engine::health::{BrokerReport, BusReport, DeviceReport, PeriodReport, Timing};
+    use crate::engine::time::{Duration, Time};
 
     #[test]
     fn every_bus_and_device_has_its_lines() {
+        let mut exceptions_by_code = Counters::default().exceptions_by_code;
+        (exceptions_by_code[0], exceptions_by_code[2]) = (1, 5);
+        let mut timing = Timing::default();
+        for millis in [3, 4, 40] {
+            timing.turned_around(Time(0), Duration::from_millis(millis));
+        }
+        let reading = |point: &str, unit: Option<&str>, value| Readout {
+            point: point.into(),
+            unit: unit.map(str::to_string),
+            value,
+        };
+        let mode = ReadoutValue::Name { holds: "\"on\"".into(), names: vec!["off".into(), "\"on\"".into()] };
         let device = DeviceReport {
+            timing: timing.report(Time(0)),
+            periods: vec![PeriodReport {
+                class: Poll::Fast,
+                wanted: Duration::from_millis(250),
+                real: Some(Duration::from_millis(400)),
+            }],
+            readings: vec![
+                reading("flow", Some("°C"), ReadoutValue::Number(21.5)),
+                reading("relay", None, ReadoutValue::Number(1.0)),
+                reading("curve", None, ReadoutValue::Numbers(vec![(0, 0.5), (2, -1.0)])),
+                reading("mode", None, mode),
+            ],
             name: "relays".into(),
             title: "Relays".into(),
             profile: "test".into(),
             unit: 1,
             online: true,
-            counters: Counters { timeouts: 7, ..Counters::default() },
+            counters: Counters { timeouts: 7, exceptions_by_code, ..Counters::default() },
             ..DeviceReport::default()
         };
         let report = BusReport {
@@ -128,15 +290,18 @@ mod tests {
             paused: false,
             counters: Counters { requests: 12, ..Counters::default() },
             load: 0.25,
+            timing: Default::default(),
             devices: vec![device],
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
-        let text = render(&GatewayReport {
-            broker,
-            buses: vec![BusHealth { report, responding: true }],
+        let gateway = |responding| GatewayReport {
+            broker: broker.clone(),
+            buses: vec![BusHealth { report: report.clone(), responding }],
             configuration_error: None,
-        })
-        .expect("text takes everything");
+        };
+        let text = render(gateway(true)).expect("text takes everything");
+        let stuck = render(gateway(false)).expect("text takes everything");
+        assert!(!stuck.contains("busker_reading{"), "nobody knows what a stuck bus would tell:\n{stuck}");
         for line in [
             "busker_broker_connected 1.0",
             "busker_broker_client_id_taken 0.0",
@@ -145,6 +310,22 @@ mod tests {
             "busker_bus_requests_total{bus=\"cellar\"} 12",
             "busker_device_timeouts_total{bus=\"cellar\",device=\"relays\"} 7",
             "busker_device_online{bus=\"cellar\",device=\"relays\"} 1.0",
+            "busker_device_exceptions_by_code_total{bus=\"cellar\",device=\"relays\",code=\"2\"} 5",
+            "busker_device_exceptions_by_code_total{bus=\"cellar\",device=\"relays\",code=\"other\"} 1",
+            "# TYPE busker_device_turnaround_seconds histogram",
+            "busker_device_turnaround_seconds_sum{bus=\"cellar\",device=\"relays\"} 0.047",
+            "busker_device_turnaround_seconds_count{bus=\"cellar\",device=\"relays\"} 3",
+            "busker_device_turnaround_seconds_bucket{le=\"0.002\",bus=\"cellar\",device=\"relays\"} 0",
+            "busker_device_turnaround_seconds_bucket{le=\"0.005\",bus=\"cellar\",device=\"relays\"} 2",
+            "busker_device_turnaround_seconds_bucket{le=\"+Inf\",bus=\"cellar\",device=\"relays\"} 3",
+            "busker_device_period_seconds{bus=\"cellar\",device=\"relays\",class=\"fast\"} 0.4",
+            "busker_device_wanted_period_seconds{bus=\"cellar\",device=\"relays\",class=\"fast\"} 0.25",
+            "# TYPE busker_reading gauge",
+            "busker_reading{device=\"relays\",point=\"flow\",unit=\"°C\"} 21.5",
+            "busker_reading{device=\"relays\",point=\"relay\",unit=\"\"} 1.0",
+            "busker_reading{device=\"relays\",point=\"curve\",element=\"2\",unit=\"\"} -1.0",
+            "busker_reading_state{device=\"relays\",point=\"mode\",state=\"off\"} 0.0",
+            "busker_reading_state{device=\"relays\",point=\"mode\",state=\"\\\"on\\\"\"} 1.0",
             "# EOF",
         ] {
             assert!(text.lines().any(|found| found == line), "{line} is not in\n{text}");

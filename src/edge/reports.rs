@@ -24,6 +24,8 @@ pub enum Detail {
     /// No points. They are most of a report, and few ask for them.
     Devices,
     Points,
+    /// The readings as numbers, and no points. They are not kept: of a bus that is stuck there are none.
+    Readings,
 }
 
 /// A bus that is asked how it is.
@@ -103,12 +105,12 @@ impl Reporter {
                     *last = report.clone();
                     report
                 }
-                (Some(report), Detail::Devices) => {
+                (Some(report), Detail::Devices | Detail::Readings) => {
                     keep_points(&mut last, report.clone());
                     report
                 }
                 (None, Detail::Points) => last.clone(),
-                (None, Detail::Devices) => without_points(last.clone()),
+                (None, Detail::Devices | Detail::Readings) => without_points(last.clone()),
             };
             buses.push(BusHealth { report, responding });
         }
@@ -129,6 +131,7 @@ pub enum NoRecording {
 /// What was last said of the points is kept for when the bus is stuck.
 fn keep_points(last: &mut BusReport, mut report: BusReport) {
     let before = std::mem::take(&mut last.devices);
+    report.devices.iter_mut().for_each(|device| device.readings = Vec::new());
     for (device, before) in report.devices.iter_mut().zip(before) {
         if device.name == before.name {
             (device.points, device.things) = (before.points, before.things);
@@ -163,6 +166,7 @@ mod tests {
             paused: false,
             counters: Counters { requests, ..Counters::default() },
             load: 0.0,
+            timing: Default::default(),
             devices: Vec::new(),
         }
     }

@@ -169,6 +169,7 @@ mod tests {
             paused: false,
             counters: Counters::default(),
             load: 0.1,
+            timing: Default::default(),
             devices: vec![device],
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };

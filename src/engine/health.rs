@@ -1,12 +1,19 @@
 //! What a bus and its devices say of themselves: counters, states and reasons.
 
 mod json;
+mod readout;
+mod spread;
 
 pub use json::{device_json, drift_json, info_json, point_json, seconds};
+pub use readout::{Readout, ReadoutValue};
+pub use spread::{Percentiles, Spread, SpreadReport, Timing, TimingReport};
 
 use crate::engine::device::{Category, Point, Poll};
 use crate::engine::modbus::{Discarded, RequestError};
 use crate::engine::time::{Duration, Time};
+
+/// The codes of the specification end with 11.
+const EXCEPTION_CODES: usize = 12;
 
 /// What happened on the wire, each error counted as what it was.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -17,6 +24,8 @@ pub struct Counters {
     pub checksum_errors: u64,
     pub wrong_frames: u64,
     pub exceptions: u64,
+    /// The same by code; in the first place those of a code that the specification does not know.
+    pub exceptions_by_code: [u32; EXCEPTION_CODES],
     pub late_replies: u64,
     pub foreign_frames: u64,
     pub echoes: u64,
@@ -45,6 +54,13 @@ impl Counters {
         ]
     }
 
+    /// The exceptions that there were, by code: `2`, `6`, `other`.
+    pub fn exceptions_by_code(&self) -> impl Iterator<Item = (String, u64)> + '_ {
+        let counted = self.exceptions_by_code.iter().enumerate().filter(|(_, count)| **count > 0);
+        counted
+            .map(|(code, count)| (if code == 0 { "other".into() } else { code.to_string() }, (*count).into()))
+    }
+
     /// Counts what was thrown away before a reply.
     pub fn count_discarded(&mut self, discarded: Discarded) {
         self.late_replies += u64::from(discarded.late_replies);
@@ -63,7 +79,11 @@ impl Counters {
         self.requests += 1;
         match result {
             Ok(_) => self.answers += 1,
-            Err(RequestError::Exception(_)) => self.exceptions += 1,
+            Err(RequestError::Exception(code)) => {
+                self.exceptions += 1;
+                let known = usize::from(*code);
+                self.exceptions_by_code[if known < EXCEPTION_CODES { known } else { 0 }] += 1;
+            }
             Err(RequestError::Timeout) => self.timeouts += 1,
             // Counted with what was thrown away.
             Err(RequestError::Checksum) => {}
@@ -89,6 +109,7 @@ pub struct BusReport {
     pub counters: Counters,
     /// The share of the last minute in which the wire was busy, 0 to 1.
     pub load: f64,
+    pub timing: TimingReport,
     pub devices: Vec<DeviceReport>,
 }
 
@@ -108,8 +129,11 @@ pub struct DeviceReport {
     pub identity: Option<String>,
     pub counters: Counters,
     pub last_answer_at: Option<Time>,
+    pub timing: TimingReport,
     pub periods: Vec<PeriodReport>,
     pub points: Vec<PointReport>,
+    /// What can be told as numbers and is true now; only where that is asked for.
+    pub readings: Vec<Readout>,
     pub things: Vec<ThingReport>,
     /// Settings that are not what the configuration wants.
     pub drift: Vec<Drift>,
@@ -390,6 +414,7 @@ mod tests {
             paused: false,
             counters: Counters::default(),
             load: 0.123_456,
+            timing: TimingReport::default(),
             devices: devices.collect(),
         };
         let broker = BrokerReport { connected, ..BrokerReport::default() };

@@ -284,7 +284,7 @@ impl Outbox {
             Some(("bridge", "state")) => Rank::BridgeState,
             Some(("bridge", _)) => Rank::Bridge,
             Some((_, "availability")) => Rank::Availability,
-            Some((_, "info")) => Rank::Info,
+            Some((_, "info" | "health")) => Rank::Info,
             _ => Rank::State,
         }
     }

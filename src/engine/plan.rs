@@ -73,7 +73,38 @@ impl Read {
     }
 }
 
-/// What the wire charges, in microseconds.
+/// What a bus charges, whichever device is asked; in nanoseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tariff {
+    /// Everything about a read but its data and the device's turnaround: both frames' other characters,
+    /// and the silence before them.
+    request: u64,
+    /// Each byte of data.
+    byte: u64,
+}
+
+impl Tariff {
+    pub fn of(link: &Link, gap: Option<Duration>) -> Tariff {
+        match link.line() {
+            Some(line) => Tariff::of_line(line, gap.unwrap_or_else(|| line.frame_gap())),
+            // A round trip costs as much as some hundred registers.
+            None => Tariff { request: 500_000, byte: 1000 },
+        }
+    }
+
+    fn of_line(line: Line, gap: Duration) -> Tariff {
+        // Request: unit, function, address, count, checksum. Answer: unit, function, count, checksum.
+        let request = line.characters(8 + 5) + gap;
+        Tariff { request: request.as_nanos() as u64, byte: line.characters(1).as_nanos() as u64 }
+    }
+
+    /// With a device that takes `turnaround` to begin its answer.
+    pub fn cost(self, turnaround: Duration) -> Cost {
+        Cost { request: self.request + turnaround.as_nanos() as u64, byte: self.byte }
+    }
+}
+
+/// What a read of one device costs, in nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Cost {
     /// Everything about a request but its data: both frames' other characters, the silence before
@@ -84,28 +115,32 @@ pub struct Cost {
 }
 
 impl Cost {
-    /// The cost on this link with a device that takes `turnaround` to begin its answer.
-    pub fn of(link: &Link, turnaround: Duration) -> Cost {
-        match link {
-            Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } => Cost::of_line(*line, turnaround),
-            // A round trip costs as much as some hundred registers.
-            Link::Tcp { .. } => Cost { request: 500 + turnaround.as_micros() as u64, byte: 1 },
-        }
-    }
-
-    fn of_line(line: Line, turnaround: Duration) -> Cost {
-        // Request: unit, function, address, count, checksum. Answer: unit, function, count, checksum.
-        let frames = line.characters(8 + 5);
-        let request = frames + line.frame_gap() + turnaround;
-        Cost { request: request.as_micros() as u64, byte: line.characters(1).as_micros() as u64 }
-    }
-
-    /// How long reading `span` takes, in microseconds.
+    /// How long reading `span` takes.
     pub fn of_read(self, span: Span) -> u64 {
-        let data = if span.table().is_bits() { span.count().div_ceil(8) } else { span.count() * 2 };
-        self.request + u64::from(data) * self.byte
+        self.request + u64::from(data_bytes(span)) * self.byte
+    }
+
+    /// The same as a time.
+    pub fn time_of(self, span: Span) -> Duration {
+        Duration::from_nanos(self.of_read(span))
     }
 }
+
+/// So many times as slow, or as quick, as it was planned with, and a device's reads are planned anew.
+const FAR: u32 = 2;
+
+/// Whether a device is so much slower or quicker that another plan may be better.
+pub fn is_far(turnaround: Duration, planned_with: Duration) -> bool {
+    turnaround > planned_with * FAR || turnaround * FAR < planned_with
+}
+
+/// The bytes of data in the answer to a read of `span`.
+pub fn data_bytes(span: Span) -> u32 {
+    if span.table().is_bits() { span.count().div_ceil(8) } else { span.count() * 2 }
+}
+
+/// What most devices need to begin their answer; the real one is known only on the wire.
+pub const USUAL_TURNAROUND: Duration = Duration::from_millis(5);
 
 /// The cheapest safe reads of `device`, by poll class, table and address. `refused` are spans that
 /// the device has refused to give in one answer ([`Read::refused`]): no read of several points

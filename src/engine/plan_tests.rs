@@ -11,7 +11,7 @@ use crate::engine::test_device::device_of;
 const LINE: Line = Line { baud: 19200, parity: Parity::Even, stop_bits: 1 };
 
 fn cost() -> Cost {
-    Cost::of_line(LINE, Duration::from_millis(5))
+    Tariff::of_line(LINE, LINE.frame_gap()).cost(USUAL_TURNAROUND)
 }
 
 fn span(table: RegisterTable, first: u16, last: u16) -> Span {

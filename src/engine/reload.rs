@@ -103,7 +103,8 @@ pub fn topics_of_devices(settings: &Settings) -> BTreeSet<String> {
         let points = device.device.points.iter().map(|point| &point.name);
         let things = device.device.things.iter().map(|thing| &thing.name);
         let states: Vec<String> = points.chain(things).map(|name| topics.state(&device.name, name)).collect();
-        [topics.availability(&device.name), topics.info(&device.name)].into_iter().chain(states)
+        let own = [topics.availability(&device.name), topics.info(&device.name), topics.health(&device.name)];
+        own.into_iter().chain(states)
     };
     settings.devices.iter().flat_map(of_device).collect()
 }

@@ -1,7 +1,7 @@
 //! Which read of a bus is next: the one that is furthest past its period.
 //!
 //! Urgency is the time since a read last began, divided by its period. On a bus that cannot keep up
-//! every period therefore stretches by the same factor, and nothing starves. Reads that are wanted at
+//! every period stretches by the same factor ([`Pace`]), and nothing starves. Reads that are wanted at
 //! once (after a connect, after a write, on request) come before all of them, selectors first.
 
 use std::sync::Arc;
@@ -30,19 +30,82 @@ struct Planned {
     /// How long after the one before it the last read began by its period.
     real_period: Option<Duration>,
     wanted_now: bool,
+    /// Has been asked in vain, and is due again whatever its period says.
+    is_repeated: bool,
     /// Has been answered since the device connected, if only with an exception.
     tried: bool,
     /// Answered with an exception: not asked again before.
     paused_until: Time,
+    /// That was the last answer.
+    is_refused: bool,
     /// Holds nothing that lives now.
     sleeps: bool,
 }
+
+/// For so long what nobody has answered waits behind everything that is overdue; on a bus that is never
+/// done with that its turn comes nevertheless.
+const REPEATED_BEHIND: Duration = Duration::from_secs(2);
 
 /// Where a read stands in the schedule.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Place {
     began_at: Option<Time>,
     wanted_now: bool,
+    is_repeated: bool,
+}
+
+/// How a bus as a whole keeps up with the periods that are wanted of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Pace {
+    /// When nothing was due.
+    idle_at: Option<Time>,
+    /// By how much periods are longer than they should be, on average.
+    stretch: f64,
+}
+
+impl Default for Pace {
+    fn default() -> Pace {
+        Pace { idle_at: None, stretch: 1.0 }
+    }
+}
+
+impl Pace {
+    /// Each turn moves the average by this part of itself.
+    const STEP: f64 = 1.0 / 32.0;
+
+    /// Nothing is due.
+    pub fn idle(&mut self, now: Time) {
+        self.idle_at = Some(now);
+    }
+
+    /// From when on a read that begins now counts its next period.
+    fn keep(
+        &mut self,
+        now: Time,
+        began_at: Time,
+        sent_at: Option<Time>,
+        period: Duration,
+        real: Duration,
+    ) -> Time {
+        let stretch = real.as_secs_f64() / period.as_secs_f64().max(1e-6);
+        self.stretch = (self.stretch + (stretch - self.stretch) * Pace::STEP).max(1.0);
+        let is_caught_up =
+            self.idle_at.is_some_and(|idle_at| sent_at.is_none_or(|sent_at| idle_at >= sent_at));
+        let due = began_at + period;
+        if is_caught_up {
+            // A read that begins a little late does not shift those after it: the period is kept on average.
+            return if due <= now && now - due < period { due } else { now };
+        }
+        // There is no time to spare. What waits longest in relation to its period goes first, but whoever
+        // has a short one waits now and then much longer than usual, and makes up for it: so each counts on
+        // with the bus's stretch, and not from when it had its turn.
+        let fair = began_at + period.mul_f64(self.stretch);
+        if now - fair >= period * 2 {
+            // After a standstill nothing is made up for.
+            return now;
+        }
+        fair.max(Time(now.0.saturating_sub(period.as_micros() as u64))).min(now + period)
+    }
 }
 
 impl Place {
@@ -76,8 +139,10 @@ impl Polls {
             sent_at: None,
             real_period: None,
             wanted_now: true,
+            is_repeated: false,
             tried: false,
             paused_until: Time::default(),
+            is_refused: false,
             sleeps: false,
         };
         Polls { reads: reads.into_iter().map(planned).collect() }
@@ -90,6 +155,19 @@ impl Polls {
     /// The same, for longer than the schedule can be borrowed.
     pub fn shared_read(&self, index: usize) -> Arc<Read> {
         self.reads[index].read.clone()
+    }
+
+    pub fn len(&self) -> usize {
+        self.reads.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.reads.is_empty()
+    }
+
+    /// Whether these are the very reads that there are.
+    pub fn has_reads(&self, reads: &[Read]) -> bool {
+        self.reads.iter().map(|planned| &*planned.read).eq(reads)
     }
 
     /// The most urgent read that may begin now.
@@ -132,23 +210,26 @@ impl Polls {
         self.reads.iter().filter_map(Planned::due_at).min()
     }
 
-    /// The read is being sent; returns where it stood before.
-    pub fn begin(&mut self, index: usize, now: Time) -> Place {
+    /// The read is being sent; returns where it stood before. `pace` is that of the
+    /// whole bus.
+    pub fn begin(&mut self, index: usize, now: Time, pace: &mut Pace) -> Place {
         let planned = &mut self.reads[index];
-        let before = Place { began_at: planned.began_at, wanted_now: planned.wanted_now };
-        // A read that begins a little late does not shift those after it: the period is kept on average.
-        let on_time =
-            planned.began_at.zip(planned.period).map(|(began_at, period)| (began_at + period, period));
-        planned.began_at = match on_time {
-            Some((due, period)) if !planned.wanted_now && due <= now && now - due < period => Some(due),
+        let (began_at, wanted_now, is_repeated) = (planned.began_at, planned.wanted_now, planned.is_repeated);
+        let before = Place { began_at, wanted_now, is_repeated };
+        let is_in_turn = !wanted_now && !is_repeated;
+        planned.began_at = match (planned.began_at, planned.period) {
+            (Some(began_at), Some(period)) if is_in_turn => {
+                let real = planned.sent_at.map_or(period, |sent_at| now - sent_at);
+                Some(pace.keep(now, began_at, planned.sent_at, period, real))
+            }
             _ => Some(now),
         };
         // A read that was wanted out of turn says nothing about the turns.
-        if !planned.wanted_now {
+        if is_in_turn {
             planned.real_period = planned.sent_at.map(|sent_at| now - sent_at);
         }
         planned.sent_at = Some(now);
-        planned.wanted_now = false;
+        (planned.wanted_now, planned.is_repeated) = (false, false);
         before
     }
 
@@ -157,6 +238,7 @@ impl Polls {
         let planned = &mut self.reads[index];
         planned.began_at = before.began_at;
         planned.wanted_now |= before.wanted_now;
+        planned.is_repeated |= before.is_repeated;
     }
 
     /// The poll class's period as the bus keeps it now: that of the slowest of its reads, a read that
@@ -170,9 +252,19 @@ impl Polls {
         of_class.filter_map(lasting).max()
     }
 
+    /// Each read with the period in which it comes round, as far as it does: as wanted, or as long as it
+    /// took.
+    pub fn with_periods(&self) -> impl Iterator<Item = (&Read, Option<Duration>)> {
+        let period = |planned: &Planned| {
+            planned.period.map(|period| planned.real_period.map_or(period, |real| real.max(period)))
+        };
+        self.reads.iter().map(move |planned| (&*planned.read, period(planned)))
+    }
+
     /// The read has been answered, if only with an exception.
     pub fn end(&mut self, index: usize) {
         self.reads[index].tried = true;
+        self.reads[index].is_refused = false;
     }
 
     /// Nothing came of the read: it is wanted as before.
@@ -180,9 +272,25 @@ impl Polls {
         self.reads[index].wanted_now = true;
     }
 
+    /// Nobody answered the read, for the moment: it is due at once, but goes before nothing that is more
+    /// overdue. A device that dies must not keep the line from all others until it counts as dead.
+    pub fn try_again(&mut self, index: usize, now: Time) {
+        let planned = &mut self.reads[index];
+        match planned.period {
+            Some(_) => (planned.is_repeated, planned.began_at) = (true, Some(now)),
+            None => planned.wanted_now = true,
+        }
+    }
+
     /// The read was refused by the device: ask again later than usual.
     pub fn pause(&mut self, index: usize, until: Time) {
         self.reads[index].paused_until = until;
+        self.reads[index].is_refused = true;
+    }
+
+    /// Whether the device has refused any read when it was last asked.
+    pub fn is_any_refused(&self) -> bool {
+        self.reads.iter().any(|planned| planned.is_refused)
     }
 
     /// Every read that holds `point` is wanted at once.
@@ -199,8 +307,10 @@ impl Polls {
     pub fn want_all(&mut self) {
         for planned in &mut self.reads {
             planned.wanted_now = true;
+            planned.is_repeated = false;
             planned.tried = false;
             planned.paused_until = Time::default();
+            planned.is_refused = false;
             // Nobody kept a period while the device was away.
             planned.sent_at = None;
             planned.real_period = None;
@@ -217,6 +327,25 @@ impl Polls {
     /// Whether each read has been answered since the connect.
     pub fn first_round_is_over(&self) -> bool {
         self.reads.iter().all(|planned| planned.tried || planned.sleeps)
+    }
+
+    /// Takes over the reads of another plan for the same points. Nothing was lost, so nothing is wanted
+    /// sooner than its period says.
+    pub fn rearrange(
+        &mut self,
+        reads: Vec<Read>,
+        intervals: Intervals,
+        is_selector: impl Fn(PointIndex) -> bool,
+    ) {
+        let old = std::mem::replace(self, Polls::new(reads, intervals, is_selector));
+        for planned in &mut self.reads {
+            let holds = |point: PointIndex| planned.read.points.iter().any(|(held, _)| *held == point);
+            let shares = |before: &&Planned| before.read.points.iter().any(|(point, _)| holds(*point));
+            let before: Vec<&Planned> = old.reads.iter().filter(shares).collect();
+            if !before.is_empty() {
+                planned.take_over(&before);
+            }
+        }
     }
 
     /// Takes over the reads of a new plan; what both plans have in common keeps its times, and only
@@ -237,14 +366,30 @@ impl Polls {
                 planned.sent_at = before.sent_at;
                 planned.real_period = before.real_period;
                 planned.wanted_now = before.wanted_now;
+                planned.is_repeated = before.is_repeated;
                 planned.tried = before.tried;
                 planned.paused_until = before.paused_until;
+                planned.is_refused = before.is_refused;
             }
         }
     }
 }
 
 impl Planned {
+    /// Takes the place of these reads, which together brought what this one brings: it is due when the
+    /// first of them would have been, and has been tried when all of them have.
+    fn take_over(&mut self, before: &[&Planned]) {
+        let first = |of: fn(&Planned) -> Option<Time>| before.iter().filter_map(|planned| of(planned)).min();
+        self.began_at = first(|planned| planned.began_at);
+        self.sent_at = first(|planned| planned.sent_at);
+        self.real_period = before.iter().filter_map(|planned| planned.real_period).max();
+        self.wanted_now = before.iter().any(|planned| planned.wanted_now);
+        self.is_repeated = before.iter().any(|planned| planned.is_repeated);
+        self.tried = before.iter().all(|planned| planned.tried);
+        self.is_refused = before.iter().any(|planned| planned.is_refused);
+        self.paused_until = before.iter().map(|planned| planned.paused_until).min().unwrap_or_default();
+    }
+
     fn urgency(&self, now: Time) -> Option<Urgency> {
         if now < self.paused_until || self.sleeps {
             return None;
@@ -254,7 +399,11 @@ impl Planned {
         }
         let (period, began_at) = (self.period?, self.began_at?);
         let waited = now - began_at;
-        (waited >= period).then(|| Urgency::Overdue(waited.as_secs_f64() / period.as_secs_f64().max(1e-6)))
+        let overdue = |waited: Duration| waited.as_secs_f64() / period.as_secs_f64().max(1e-6);
+        if self.is_repeated {
+            return Some(Urgency::Overdue(overdue(waited.saturating_sub(REPEATED_BEHIND)).max(1.0)));
+        }
+        (waited >= period).then(|| Urgency::Overdue(overdue(waited)))
     }
 
     /// For how many of its periods it has waited. What has no period and is wanted counts in tens of seconds,
@@ -272,7 +421,11 @@ impl Planned {
         if self.sleeps {
             return None;
         }
-        let due = if self.wanted_now { Time::default() } else { self.began_at? + self.period? };
+        let due = if self.wanted_now || self.is_repeated {
+            Time::default()
+        } else {
+            self.began_at? + self.period?
+        };
         Some(due.max(self.paused_until))
     }
 }
@@ -299,15 +452,19 @@ mod tests {
     fn run(polls: &mut Polls, cost: Duration, until: Time) -> Vec<u32> {
         let mut counts = vec![0; polls.reads.len()];
         let mut now = Time::default();
+        let mut pace = Pace::default();
         while now < until {
             match polls.most_urgent(now) {
                 Some((index, _)) => {
-                    polls.begin(index, now);
+                    polls.begin(index, now, &mut pace);
                     polls.end(index);
                     counts[index] += 1;
                     now += cost;
                 }
-                None => now = polls.due_at().expect("a period"),
+                None => {
+                    pace.idle(now);
+                    now = polls.due_at().expect("a period");
+                }
             }
         }
         counts
@@ -323,7 +480,7 @@ mod tests {
     fn the_real_period_is_what_the_bus_keeps_and_not_what_was_asked_for() {
         let fast = |polls: &Polls, now| polls.real_period(Poll::Fast, now).map(|period| period.as_millis());
         let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
-        polls.begin(0, Time::default());
+        polls.begin(0, Time::default(), &mut Pace::default());
         assert_eq!(fast(&polls, Time::from_millis(50)), None, "nothing has come round");
         run(&mut polls, Duration::from_millis(5), Time::from_millis(10_000));
         assert_eq!(fast(&polls, Time::from_millis(10_000)), Some(100));
@@ -343,6 +500,61 @@ mod tests {
         let fast_stretch = 1000.0 / f64::from(counts[0]);
         let slow_stretch = 100.0 / f64::from(counts[2]);
         assert!((fast_stretch / slow_stretch - 1.0).abs() < 0.1, "{counts:?}");
+        // Also where it is asked for only a little too much.
+        let mut polls = self::polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
+        let counts = run(&mut polls, Duration::from_millis(60), Time::from_millis(100_000));
+        let stretches = [1000.0 / f64::from(counts[0]), 100.0 / f64::from(counts[2])];
+        assert!(stretches.iter().all(|stretch| (1.15..1.45).contains(stretch)), "{counts:?}");
+    }
+
+    #[test]
+    fn what_was_asked_in_vain_is_due_at_once_but_not_before_what_is_more_overdue() {
+        let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
+        run(&mut polls, Duration::from_millis(5), Time::from_millis(5_000));
+        let now = Time::from_millis(5_300);
+        polls.begin(2, now, &mut Pace::default());
+        polls.try_again(2, now);
+        assert_eq!(polls.due_at(), Some(Time::default()));
+        // The others have waited for more than twice their period.
+        let order: Vec<usize> = std::iter::from_fn(|| {
+            let (index, _) = polls.most_urgent(now)?;
+            polls.begin(index, now, &mut Pace::default());
+            Some(index)
+        })
+        .collect();
+        assert_eq!(order, [0, 1, 2]);
+    }
+
+    #[test]
+    fn another_plan_keeps_what_is_known_of_the_reads_that_it_replaces() {
+        let read = |poll, points: &[u16]| {
+            let places = points
+                .iter()
+                .map(|at| (usize::from(*at), Address { span: Span::single(Table::Input, *at), bits: None }));
+            let span = Span::new(Table::Input, points[0], points[points.len() - 1]).expect("a span");
+            Read { poll, span, points: places.collect(), alone: false }
+        };
+        let intervals = Intervals { fast: Duration::from_millis(100), slow: Duration::from_millis(1000) };
+        let apart = || vec![read(Poll::Fast, &[0]), read(Poll::Fast, &[9]), read(Poll::Slow, &[3])];
+        let together = || vec![read(Poll::Fast, &[0, 9]), read(Poll::Slow, &[3])];
+        let mut polls = Polls::new(apart(), intervals, |_| false);
+        for (index, at) in [(0, 10), (1, 40), (2, 60)] {
+            polls.begin(index, Time::from_millis(at), &mut Pace::default());
+            polls.end(index);
+        }
+        assert!(polls.has_reads(&apart()) && !polls.has_reads(&together()));
+        polls.rearrange(together(), intervals, |_| false);
+        assert!(polls.has_reads(&together()) && polls.first_round_is_over());
+        // Due when the first of them would have been, and not at once.
+        assert_eq!(polls.due_at(), Some(Time::from_millis(110)));
+        polls.begin(0, Time::from_millis(110), &mut Pace::default());
+        polls.rearrange(apart(), intervals, |_| false);
+        assert_eq!(polls.due_at(), Some(Time::from_millis(210)));
+        assert_eq!(polls.most_urgent(Time::from_millis(209)), None);
+        // What has not been answered yet is still wanted.
+        polls.want(9);
+        polls.rearrange(together(), intervals, |_| false);
+        assert_eq!(polls.most_urgent(Time::from_millis(120)), Some((0, Urgency::Wanted)));
     }
 
     #[test]

@@ -125,6 +125,12 @@ impl Values {
         absorbed
     }
 
+    /// The reads have changed. What one of them brought long ago may come again while others have brought
+    /// something else since.
+    pub fn forget_words(&mut self) {
+        self.heard.clear();
+    }
+
     /// Takes in the words of a read that began after every write before it. Selectors come first:
     /// what a selector decides is never understood by what it said before.
     pub fn absorb(&mut self, now: Time, device: &Device, read: &Read, words: &[u16]) -> Absorbed {

@@ -76,6 +76,11 @@ impl Topics {
         format!("{}/{device}/info", self.base)
     }
 
+    /// How the device is on its wire; retained, told each minute.
+    pub fn health(&self, device: &str) -> String {
+        format!("{}/{device}/health", self.base)
+    }
+
     /// Where a point's value stands; retained.
     pub fn state(&self, device: &str, point: &str) -> String {
         format!("{}/{device}/{point}", self.base)

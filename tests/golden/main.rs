@@ -20,10 +20,9 @@ use std::path::PathBuf;
 use std::sync::LazyLock;
 
 use busker::engine::device::Device;
-use busker::engine::plan::{Cost, Read, Table, plan};
+use busker::engine::plan::{Read, Table, Tariff, USUAL_TURNAROUND, plan};
 use busker::engine::profile::Library;
 use busker::engine::settings::{Line, Link, Parity};
-use busker::engine::time::Duration;
 
 #[test]
 fn the_points_are_those_of_the_manual() {
@@ -90,7 +89,7 @@ fn shipped() -> &'static [(String, Device)] {
 fn usual_plan(device: &Device) -> Vec<Read> {
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
     let link = Link::Serial { path: String::new(), line };
-    plan(device, Cost::of(&link, Duration::from_millis(5)), &[])
+    plan(device, Tariff::of(&link, None).cost(USUAL_TURNAROUND), &[])
 }
 
 /// Holds `actual` against the golden file, or rewrites the file.

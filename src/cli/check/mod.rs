@@ -1,5 +1,7 @@
 //! `busker check`: is the configuration right, and can each bus keep up with it?
 
+mod advice;
+mod budget;
 mod feeding;
 
 use std::collections::BTreeMap;
@@ -10,12 +12,11 @@ use super::configuration::{self, ConfigurationArgs, Loaded};
 use super::output::{self, Table};
 use super::{Failure, output::print_json};
 use crate::engine;
-use crate::engine::device::Poll;
-use crate::engine::plan::{Cost, plan};
-use crate::engine::settings::{Bus, DeviceSettings, Link};
+use crate::engine::settings::{Bus, DeviceSettings};
 use crate::engine::time::Duration;
-use crate::engine::yaml::Diagnostic;
-use feeding::Feeding;
+use crate::engine::yaml::{Diagnostic, Scalar};
+use budget::Budget;
+use feeding::{Delays, Feeding};
 
 /// Check the configuration and the profiles that it uses
 ///
@@ -26,6 +27,9 @@ use feeding::Feeding;
 pub struct Args {
     #[command(flatten)]
     configuration: ConfigurationArgs,
+    /// What devices need to begin their answer; see `turnaround` on the status page or in the metrics
+    #[arg(long, value_name = "TIME", default_value = "5ms", value_parser = <Duration as Scalar>::parse)]
+    turnaround: Duration,
     /// Tell it as JSON
     #[arg(long)]
     json: bool,
@@ -41,7 +45,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let file = args.configuration.config.display().to_string();
     match checked(&args)? {
         Ok(loaded) => {
-            let summary = Summary::of(file, &loaded);
+            let summary = Summary::of(file, &loaded, args.turnaround);
             if args.json {
                 return print_json(&summary);
             }
@@ -76,6 +80,8 @@ fn checked(args: &Args) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
 struct Summary {
     file: String,
     status: &'static str,
+    /// What devices are taken to need to begin their answer, in seconds.
+    turnaround: f64,
     warnings: Vec<Finding>,
     buses: Vec<BusSummary>,
 }
@@ -92,6 +98,8 @@ struct BusSummary {
     command_wait: f64,
     /// The same where a device is silent.
     command_wait_one_silent: f64,
+    /// What to change where the polls want more than the wire carries.
+    advice: Vec<String>,
     devices: Vec<DeviceSummary>,
 }
 
@@ -135,20 +143,27 @@ impl Finding {
 }
 
 impl Summary {
-    fn of(file: String, loaded: &Loaded) -> Summary {
+    fn of(file: String, loaded: &Loaded, turnaround: Duration) -> Summary {
         let settings = &loaded.settings;
-        let on_bus = |index: usize| settings.devices.iter().filter(move |device| device.bus == index);
+        let on_bus = |index: usize| -> Vec<&DeviceSettings> {
+            settings.devices.iter().filter(|device| device.bus == index).collect()
+        };
         let buses = settings.buses.iter().enumerate();
         Summary {
             file,
             status: "good",
+            turnaround: turnaround.as_secs_f64(),
             warnings: loaded.warnings.iter().map(Finding::of).collect(),
-            buses: buses.map(|(index, bus)| BusSummary::of(bus, on_bus(index))).collect(),
+            buses: buses.map(|(index, bus)| BusSummary::of(bus, &on_bus(index), turnaround)).collect(),
         }
     }
 
     fn text(&self) -> String {
-        let mut text = format!("{} is good\n", self.file);
+        let mut text = format!(
+            "{} is good\nThe figures hold for devices that begin their answers after {}.\n",
+            self.file,
+            told(self.turnaround)
+        );
         for bus in &self.buses {
             let line = bus.line.as_ref().map_or(String::new(), |line| format!(" {line}"));
             text.push_str(&format!("\nbus {}: {}{line}\n", bus.name, bus.link));
@@ -159,9 +174,10 @@ impl Summary {
                 told(bus.command_wait_one_silent),
             ));
             if bus.load > 1.0 {
+                let advice = bus.advice.join("; or ");
+                let slower = (bus.load * 10.0).ceil() / 10.0;
                 text.push_str(&format!(
-                    "  too slow: every period is {:.1} times as long as wanted; read less often, or faster lines\n",
-                    bus.load
+                    "  too slow: every period is {slower:.1} times as long as wanted; {advice}\n"
                 ));
             }
             let mut table = Table::new();
@@ -200,70 +216,43 @@ impl PollSummary {
 }
 
 impl BusSummary {
-    fn of<'s>(bus: &Bus, devices: impl Iterator<Item = &'s DeviceSettings> + Clone) -> BusSummary {
-        let mut longest_read = Duration::ZERO;
-        let mut longest_timeout = bus.response_timeout;
-        let mut summaries = Vec::new();
-        for settings in devices.clone() {
-            let wire = &settings.device.wire;
-            longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
-            let cost = Cost::of(&bus.link, USUAL_TURNAROUND);
+    fn of(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> BusSummary {
+        let budget = Budget::of(bus, devices, turnaround);
+        let load = budget.load();
+        let summary = |(number, settings): (usize, &&DeviceSettings)| {
             let mut polls: BTreeMap<&'static str, PollSummary> = BTreeMap::new();
-            for read in plan(&settings.device, cost, &[]) {
-                let time = Duration::from_micros(cost.of_read(read.span)) + wire.limits.delay;
-                longest_read = longest_read.max(time);
-                let period = match read.poll {
-                    Poll::Fast => Some(wire.intervals.fast.as_secs_f64()),
-                    Poll::Slow => Some(wire.intervals.slow.as_secs_f64()),
-                    Poll::Once | Poll::Never => None,
-                };
-                let poll = polls.entry(read.poll.name()).or_insert(PollSummary {
-                    reads: 0,
-                    seconds: 0.0,
-                    period,
-                    real_period: None,
-                });
+            for read in budget.reads.iter().filter(|read| read.device == number) {
+                // A bus that cannot keep up stretches every period by the same factor.
+                let real_period = read.period.map(|period| period * load.max(1.0));
+                let empty = PollSummary { reads: 0, seconds: 0.0, period: read.period, real_period };
+                let poll = polls.entry(read.poll.name()).or_insert(empty);
                 poll.reads += 1;
-                poll.seconds += time.as_secs_f64();
+                poll.seconds += read.time;
             }
-            summaries.push(DeviceSummary {
+            let periods = polls.values().filter_map(|poll| poll.real_period);
+            let asked_every = periods.reduce(f64::min);
+            DeviceSummary {
                 name: settings.name.clone(),
                 title: settings.title.clone(),
                 profile: settings.device.profile.clone(),
                 unit: settings.unit,
                 points: settings.device.points.len(),
                 polls,
-                feeding: Vec::new(),
-            });
-        }
-        let polls = || summaries.iter().flat_map(|device| device.polls.values());
-        let load: f64 = polls().filter_map(|poll| Some(poll.seconds / poll.period?)).sum();
-        // A bus that cannot keep up stretches every period by the same factor.
-        for poll in summaries.iter_mut().flat_map(|device| device.polls.values_mut()) {
-            poll.real_period = poll.period.map(|period| period * load.max(1.0));
-        }
-        for (summary, settings) in summaries.iter_mut().zip(devices) {
-            let periods = summary.polls.values().filter_map(|poll| poll.real_period);
-            let delays = feeding::delays(periods.reduce(f64::min), longest_read, longest_timeout);
-            summary.feeding = feeding::of_device(settings, delays);
-        }
+                feeding: feeding::of_device(settings, Delays::of(bus, settings, asked_every, &budget)),
+            }
+        };
         BusSummary {
             name: bus.name.clone(),
             link: bus.link.to_string(),
-            line: match &bus.link {
-                Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } => Some(line.to_string()),
-                Link::Tcp { .. } => None,
-            },
+            line: bus.link.line().map(|line| line.to_string()),
             load,
-            command_wait: longest_read.as_secs_f64(),
-            command_wait_one_silent: longest_timeout.max(longest_read).as_secs_f64(),
-            devices: summaries,
+            command_wait: budget.longest(),
+            command_wait_one_silent: budget.one_silent.max(budget.longest()),
+            advice: advice::of_bus(bus, devices, turnaround, &budget),
+            devices: devices.iter().enumerate().map(summary).collect(),
         }
     }
 }
-
-/// What most devices need to begin their answer; the real one is known only on the wire.
-const USUAL_TURNAROUND: Duration = Duration::from_millis(5);
 
 /// Seconds for people: `37 ms`, `1.5 s`, `10 min`.
 fn told(seconds: f64) -> String {

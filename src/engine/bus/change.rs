@@ -2,6 +2,7 @@
 
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::memory::Memories;
+use crate::engine::plan::Tariff;
 use crate::engine::settings::DeviceSettings;
 
 use super::device::DeviceState;
@@ -79,8 +80,9 @@ impl Bus {
 
     /// These devices come, as at the start of the bus.
     pub(super) fn adopt(&mut self, devices: Vec<DeviceSettings>, memories: &Memories) {
+        let tariff = Tariff::of(&self.link, self.gap);
         for settings in devices {
-            let mut device = DeviceState::new(settings, self.cost(), self.eeprom);
+            let mut device = DeviceState::new(settings, tariff, self.eeprom);
             self.counters.persistent_writes += device.recall(memories);
             device.introduce(self.now, &mut self.context);
             if self.link_state == LinkState::Up {

@@ -19,6 +19,8 @@ pub(super) struct Active {
     pub(super) device: usize,
     target: Target,
     wanted: String,
+    /// When it came, until its first request is on its way; not of a setting, which nobody gave.
+    pub(super) came_at: Option<Time>,
     flow: CommandFlow,
     /// What of a thing's command is still to be written.
     orders: VecDeque<(PointIndex, String)>,
@@ -121,7 +123,7 @@ impl Bus {
         let (devices, settling, now) = (&self.devices, &self.settling, self.now);
         let can_begin = |waiting: &Waiting| can_begin(devices, settling, now, waiting);
         let Some(waiting) = self.waiting.take_first(can_begin) else { return false };
-        let Waiting { device, target, wanted, .. } = waiting;
+        let Waiting { device, target, wanted, came_at, .. } = waiting;
         let orders = match target {
             Target::Point(point) | Target::Setting(point) => VecDeque::from([(point, wanted.clone())]),
             Target::Thing(thing) => match self.devices[device].orders(thing, &wanted) {
@@ -132,7 +134,7 @@ impl Bus {
                 }
             },
         };
-        self.begin_order(device, target, wanted, orders);
+        self.begin_order(device, target, wanted, Some(came_at), orders);
         true
     }
 
@@ -159,7 +161,7 @@ impl Bus {
         let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
         let Some((device, (point, wanted))) = devices.find_map(next) else { return false };
         let orders = VecDeque::from([(point, wanted.clone())]);
-        self.begin_order(device, Target::Setting(point), wanted, orders);
+        self.begin_order(device, Target::Setting(point), wanted, None, orders);
         true
     }
 
@@ -169,12 +171,15 @@ impl Bus {
         device: usize,
         target: Target,
         wanted: String,
+        came_at: Option<Time>,
         mut orders: VecDeque<(PointIndex, String)>,
     ) {
         let Some((point, value)) = orders.pop_front() else { return };
         let state = &self.devices[device];
         match CommandFlow::begin(state.device(), point, &value, state.known()) {
-            (Some(flow), step) => self.take_step(Active { device, target, wanted, flow, orders }, step),
+            (Some(flow), step) => {
+                self.take_step(Active { device, target, wanted, came_at, flow, orders }, step);
+            }
             (None, Step::Finished(outcome)) => {
                 self.setting_ended(device, target, &outcome);
                 self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
@@ -226,8 +231,8 @@ impl Bus {
                 let is_done = matches!(outcome.kind, OutcomeKind::Done | OutcomeKind::Unchanged);
                 if is_done && !active.orders.is_empty() {
                     self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
-                    let Active { target, wanted, orders, .. } = active;
-                    self.begin_order(device, target, wanted, orders);
+                    let Active { target, wanted, came_at, orders, .. } = active;
+                    self.begin_order(device, target, wanted, came_at, orders);
                 } else {
                     self.end_command(active, outcome);
                 }

@@ -8,6 +8,7 @@ mod patience;
 mod reporting;
 mod requested;
 mod telling;
+mod turnaround;
 mod wear;
 
 use std::collections::BTreeMap;
@@ -20,8 +21,8 @@ use crate::engine::health::Counters;
 use crate::engine::homeassistant::{self, Outline};
 use crate::engine::identity;
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
-use crate::engine::plan::{self, Cost, Read};
-use crate::engine::schedule::{Place, Polls, Urgency};
+use crate::engine::plan::{self, Read, Tariff};
+use crate::engine::schedule::{Pace, Place, Polls, Urgency};
 use crate::engine::settings::{DeviceSettings, Eeprom};
 use crate::engine::state::{Absorbed, Values};
 use crate::engine::time::{Duration, Time};
@@ -33,6 +34,7 @@ use super::{Context, Severity};
 use beats::Beats;
 use keeping::Keeping;
 use patience::{FAILURES_UNTIL_OFFLINE, Patience};
+use turnaround::Turnaround;
 use wear::Wear;
 
 /// A device that is not the one that the profile describes is asked again after this.
@@ -44,7 +46,8 @@ const PAUSE_BUSY: Duration = Duration::from_millis(200);
 
 pub(super) struct DeviceState {
     settings: DeviceSettings,
-    cost: Cost,
+    tariff: Tariff,
+    turnaround: Turnaround,
     values: Values,
     polls: Polls,
     /// What the device has refused to give in one answer.
@@ -112,12 +115,14 @@ impl Turn {
 }
 
 impl DeviceState {
-    pub(super) fn new(settings: DeviceSettings, cost: Cost, eeprom: Eeprom) -> DeviceState {
+    pub(super) fn new(settings: DeviceSettings, tariff: Tariff, eeprom: Eeprom) -> DeviceState {
         let values = Values::new(&settings.device);
-        let reads = plan::plan(&settings.device, cost, &[]);
+        let turnaround = Turnaround::default();
+        let reads = plan::plan(&settings.device, tariff.cost(turnaround.planned_with()), &[]);
         let polls = Polls::new(reads, settings.device.wire.intervals, |point| values.is_selector(point));
         DeviceState {
-            cost,
+            tariff,
+            turnaround,
             values,
             polls,
             refused: Vec::new(),
@@ -146,6 +151,12 @@ impl DeviceState {
             is_leaving: false,
             settings,
         }
+    }
+
+    /// The cheapest reads, as far as it is known what they cost and what the device refuses.
+    fn plan(&self) -> Vec<Read> {
+        let cost = self.tariff.cost(self.turnaround.planned_with());
+        plan::plan(&self.settings.device, cost, &self.refused)
     }
 
     // What others ask about it.
@@ -237,8 +248,8 @@ impl DeviceState {
     }
 
     /// Returns what its turn was before.
-    pub(super) fn begin_read(&mut self, read: usize, now: Time) -> Turn {
-        Turn { place: Some(self.polls.begin(read, now)), ..self.turn() }
+    pub(super) fn begin_read(&mut self, read: usize, now: Time, pace: &mut Pace) -> Turn {
+        Turn { place: Some(self.polls.begin(read, now, pace)), ..self.turn() }
     }
 
     pub(super) fn turn(&self) -> Turn {
@@ -413,7 +424,7 @@ impl DeviceState {
         if answered && self.presence != Presence::Present {
             // A device without an identification is there when it answers a read.
             self.arrive(now, context);
-            self.polls.begin(index, self.served_at);
+            self.polls.begin(index, self.served_at, &mut Pace::default());
         }
         match result {
             Ok(answer) => {
@@ -424,11 +435,15 @@ impl DeviceState {
             }
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
-                self.polls.want_again(index);
                 self.failed(now, &error, context);
+                match self.presence {
+                    Presence::Present => self.polls.try_again(index, now),
+                    _ => self.polls.want_again(index),
+                }
             }
         }
         self.after_news(now, context);
+        self.adapt_plan(context);
     }
 
     /// The device answered a read with an exception: it is there, but will not tell this.
@@ -443,7 +458,7 @@ impl DeviceState {
         if !suspects.is_empty() {
             self.refused.extend(suspects);
             self.keeping.has_changed();
-            let reads = plan::plan(&self.settings.device, self.cost, &self.refused);
+            let reads = self.plan();
             let values = &self.values;
             self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
             self.wake_reads();

@@ -11,20 +11,23 @@ mod load;
 mod pause;
 mod recording;
 mod requests;
+mod timekeeping;
 mod turns;
 mod waiting;
 
 use std::collections::VecDeque;
 
+use crate::engine::address::Span;
 use crate::engine::command;
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
 use crate::engine::homeassistant::Gateway;
 use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
-use crate::engine::plan::Cost;
+use crate::engine::plan::Tariff;
 use crate::engine::recorder::Recording;
 use crate::engine::request;
+use crate::engine::schedule::Pace;
 use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settings};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
@@ -32,10 +35,10 @@ use crate::engine::topics::Message;
 use commands::{Active, Settling};
 use device::{DeviceState, Turn};
 use fetch::Fetch;
-use load::Load;
 use recording::Recorder;
 pub use recording::Saved;
 use requests::Requests;
+use timekeeping::Timekeeping;
 use waiting::{Target, WaitingCommands};
 
 /// After so many requests in a row that nobody answers, a TCP connection is made anew.
@@ -119,6 +122,8 @@ pub enum Severity {
 pub struct Bus {
     name: String,
     link: Link,
+    /// Silence before each request; `None`: the line's own.
+    gap: Option<Duration>,
     response_timeout: Duration,
     on_broker_loss: OnBrokerLoss,
     eeprom: Eeprom,
@@ -139,6 +144,7 @@ pub struct Bus {
     in_flight: Option<InFlight>,
     /// Requests in a row that were wanted at once.
     ahead: u32,
+    pace: Pace,
     link_state: LinkState,
     /// A device on this link needs silence behind a connect: nothing is asked before.
     silent_until: Time,
@@ -146,7 +152,7 @@ pub struct Bus {
     unanswered: u32,
     broker_up: bool,
     counters: Counters,
-    load: Load,
+    times: Timekeeping,
     stopping: bool,
     recorder: Recorder,
     /// When something is to be stored next.
@@ -198,6 +204,12 @@ struct InFlight {
     device: Option<usize>,
     purpose: Purpose,
     sent_at: Time,
+    /// When it was decided on.
+    decided_at: Time,
+    /// What it reads, if it does.
+    reads: Option<Span>,
+    /// When the command came of which this is the first request.
+    commanded_at: Option<Time>,
     /// What the device's turn was before, in case this is taken back.
     before: Option<Turn>,
     /// Somebody wants it at once, while others wait for their turn.
@@ -233,10 +245,10 @@ impl Bus {
             bus_name: bus.name.clone(),
             republish: settings.republish,
         };
-        let cost = cost(&bus.link);
+        let tariff = Tariff::of(&bus.link, bus.gap);
         let of_bus = settings.devices.iter().filter(|device| device.bus == index);
         let mut devices: Vec<DeviceState> =
-            of_bus.map(|device| DeviceState::new(device.clone(), cost, settings.eeprom)).collect();
+            of_bus.map(|device| DeviceState::new(device.clone(), tariff, settings.eeprom)).collect();
         let mut counters = Counters::default();
         for device in &mut devices {
             counters.persistent_writes += device.recall(memories);
@@ -248,6 +260,7 @@ impl Bus {
         Bus {
             name: bus.name.clone(),
             link: bus.link.clone(),
+            gap: bus.gap,
             response_timeout: bus.response_timeout,
             on_broker_loss: settings.on_broker_loss,
             eeprom: settings.eeprom,
@@ -262,12 +275,13 @@ impl Bus {
             wrote_setting: false,
             in_flight: None,
             ahead: 0,
+            pace: Pace::default(),
             link_state: LinkState::Down { reason: None, attempts: 0 },
             silent_until: now,
             unanswered: 0,
             broker_up: true,
             counters,
-            load: Load::default(),
+            times: Timekeeping::default(),
             stopping: false,
             recorder: Recorder::new(settings.recorder),
             record_due_at,
@@ -346,10 +360,6 @@ impl Bus {
             .min()
     }
 
-    fn cost(&self) -> Cost {
-        cost(&self.link)
-    }
-
     /// Whether a shutdown has been asked for and nothing is in flight any more.
     pub fn is_finished(&self) -> bool {
         self.stopping && self.in_flight.is_none()
@@ -359,6 +369,15 @@ impl Bus {
     pub fn report(&self, now: Time) -> BusReport {
         let devices = self.devices.iter().map(|device| device.report(now)).collect();
         BusReport { devices, ..self.summary(now) }
+    }
+
+    /// With the readings as numbers, for `/metrics`.
+    pub fn readings(&self, now: Time) -> BusReport {
+        let mut report = self.summary(now);
+        for (told, device) in report.devices.iter_mut().zip(&self.devices) {
+            told.readings = device.readings(now);
+        }
+        report
     }
 
     /// The same without points, which are most of it.
@@ -376,7 +395,8 @@ impl Bus {
             reason,
             paused: matches!(self.link_state, LinkState::Paused { .. }),
             counters: self.counters,
-            load: self.load.share(now),
+            load: self.times.load(now),
+            timing: self.times.report(now),
             devices: self.devices.iter().map(|device| device.summary(now)).collect(),
         }
     }
@@ -444,7 +464,7 @@ impl Bus {
         self.record_reply(in_flight.device, &reply);
         self.counters.count_result(&reply.result);
         self.counters.count_discarded(reply.discarded);
-        self.load.add(in_flight.sent_at.max(reply.sent_at), self.now);
+        self.keep_time(&in_flight, &reply);
         if let Some(device) = in_flight.device {
             self.devices[device].count(self.now, &reply);
             self.unanswered =
@@ -526,9 +546,4 @@ impl Bus {
         }
         self.record_due_at = self.devices.iter().filter_map(DeviceState::record_due_at).min();
     }
-}
-
-/// What a read costs, until a device's own latency is measured.
-fn cost(link: &Link) -> Cost {
-    Cost::of(link, Duration::from_millis(5))
 }

@@ -5,6 +5,7 @@
 //! whichever device's read (or identification) is most urgent. Nobody who asks without end keeps a read that
 //! is due from the wire: [`AHEAD_OF_READS`].
 
+use crate::engine::address::Span;
 use crate::engine::modbus::{Call, Request};
 
 use super::device::{DeviceState, Polled};
@@ -55,6 +56,7 @@ impl Bus {
                 if read_before_setting || read_before_request {
                     continue;
                 }
+                self.pace.idle(now);
                 return;
             };
             self.poll(device, polled);
@@ -164,18 +166,25 @@ impl Bus {
     pub(super) fn send(&mut self, device: usize, call: Call, purpose: Purpose) {
         let state = &mut self.devices[device];
         let before = match purpose {
-            Purpose::Poll { read } => state.begin_read(read, self.now),
+            Purpose::Poll { read } => state.begin_read(read, self.now, &mut self.pace),
             _ => state.turn(),
         };
         let is_poll = matches!(purpose, Purpose::Poll { .. });
         let is_wish = matches!(purpose, Purpose::Command | Purpose::Fetch | Purpose::BeatRead(_));
         let timeout = state.timeout(self.response_timeout);
         let not_before = state.asked(self.now);
+        let commanded_at = match purpose {
+            Purpose::Command => self.active.as_mut().and_then(|active| active.came_at.take()),
+            _ => None,
+        };
         let request = state.request(call);
         self.in_flight = Some(InFlight {
             device: Some(device),
             purpose,
             sent_at: not_before,
+            decided_at: self.now,
+            reads: reads_of(&request.call),
+            commanded_at,
             out_of_turn: is_wish || (is_poll && before.was_wanted()),
             before: Some(before),
             gives_way: is_poll,
@@ -186,9 +195,24 @@ impl Bus {
     /// Asks a unit that is no device of this gateway.
     pub(super) fn send_stranger(&mut self, request: Request, purpose: Purpose) {
         let (now, timeout) = (self.now, self.response_timeout);
-        let (before, out_of_turn, gives_way) = (None, false, false);
-        self.in_flight =
-            Some(InFlight { device: None, purpose, sent_at: now, before, out_of_turn, gives_way });
+        self.in_flight = Some(InFlight {
+            device: None,
+            purpose,
+            sent_at: now,
+            decided_at: now,
+            reads: None,
+            commanded_at: None,
+            before: None,
+            out_of_turn: false,
+            gives_way: false,
+        });
         self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
+    }
+}
+
+fn reads_of(call: &Call) -> Option<Span> {
+    match call {
+        Call::Read(span) => Some(*span),
+        _ => None,
     }
 }

@@ -20,6 +20,8 @@ pub struct Waiting {
     pub target: Target,
     pub wanted: String,
     pub deadline: Time,
+    /// Since when it could begin, for all that the bus does not decide.
+    pub came_at: Time,
     is_press: bool,
 }
 
@@ -31,7 +33,7 @@ impl Waiting {
 
     /// A command that may begin at `from`.
     pub fn new(from: Time, device: usize, target: Target, wanted: String, is_press: bool) -> Waiting {
-        let mut waiting = Waiting { device, target, wanted, deadline: from, is_press };
+        let mut waiting = Waiting { device, target, wanted, deadline: from, came_at: from, is_press };
         waiting.put_off(from);
         waiting
     }
@@ -40,6 +42,7 @@ impl Waiting {
     pub fn put_off(&mut self, from: Time) {
         let time_to_live = if self.is_press { Waiting::PRESS_TIME_TO_LIVE } else { Waiting::TIME_TO_LIVE };
         self.deadline = from + time_to_live;
+        self.came_at = from;
     }
 }
 

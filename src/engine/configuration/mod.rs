@@ -8,6 +8,8 @@ mod wanted;
 mod wishes;
 mod words;
 
+pub use words::BAUD_RATES;
+
 use std::path::PathBuf;
 use std::sync::Arc;
 

@@ -74,7 +74,7 @@ impl Scalar for Unit {
 pub struct BaudRate(pub u32);
 
 /// What serial adapters and devices offer. A rate beside them is rather a slip of the fingers.
-const BAUD_RATES: [u32; 19] = [
+pub const BAUD_RATES: [u32; 19] = [
     300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 57600, 76800, 115_200, 125_000, 187_500,
     230_400, 250_000, 460_800, 921_600,
 ];

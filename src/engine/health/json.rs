@@ -4,7 +4,10 @@ use std::collections::BTreeSet;
 
 use serde_json::{Map, Value, json};
 
-use super::{BusHealth, Counters, DeviceReport, Drift, GatewayReport, PointReport, ThingReport};
+use super::{
+    BusHealth, Counters, DeviceReport, Drift, GatewayReport, Percentiles, PointReport, ThingReport,
+    TimingReport,
+};
 use crate::engine::settings::Settings;
 use crate::engine::time::{Duration, Time};
 
@@ -44,16 +47,7 @@ impl GatewayReport {
             self.buses.iter().map(|bus| (bus.report.name.clone(), bus_json(bus))).collect();
         let devices: Map<String, Value> = self
             .devices()
-            .map(|(bus, device)| {
-                let mut value = object(json!({
-                    "online": device.online,
-                    "reason": device.reason,
-                    "bus": bus.name,
-                    "unit": device.unit,
-                }));
-                value.extend(counters_json(&device.counters));
-                (device.name.clone(), value.into())
-            })
+            .map(|(bus, device)| (device.name.clone(), device.health_json(&bus.name)))
             .collect();
         let mut value = object(self.summary_json());
         value.insert("buses".into(), buses.into());
@@ -111,6 +105,36 @@ impl GatewayReport {
     }
 }
 
+impl DeviceReport {
+    /// How it is on its wire.
+    pub fn health_json(&self, bus: &str) -> Value {
+        let mut value = object(json!({
+            "online": self.online,
+            "reason": self.reason,
+            "bus": bus,
+            "unit": self.unit,
+            "periods": self.periods_json(),
+        }));
+        value.extend(counters_json(&self.counters));
+        value.insert("exceptions_by_code".into(), codes_json(&self.counters));
+        value.extend(times_json(&self.timing, false));
+        value.into()
+    }
+
+    fn periods_json(&self) -> Value {
+        let periods: Map<String, Value> = self
+            .periods
+            .iter()
+            .map(|period| {
+                let told =
+                    json!({"wanted_seconds": seconds(period.wanted), "seconds": period.real.map(seconds)});
+                (period.class.name().to_string(), told)
+            })
+            .collect();
+        periods.into()
+    }
+}
+
 impl BusHealth {
     /// One entry of `GET /api/buses`.
     pub fn named_json(&self) -> Value {
@@ -134,22 +158,16 @@ fn bus_json(bus: &BusHealth) -> Value {
         "load": (report.load * 1000.0).round() / 1000.0,
     }));
     value.extend(counters_json(&report.counters));
+    value.insert("exceptions_by_code".into(), codes_json(&report.counters));
+    value.extend(times_json(&report.timing, true));
     value.into()
 }
 
 /// Everything of a device but its points.
 pub fn device_json(bus: &BusHealth, device: &DeviceReport, now: Time) -> Value {
-    let periods: Map<String, Value> = device
-        .periods
-        .iter()
-        .map(|period| {
-            let told = json!({"wanted_seconds": seconds(period.wanted), "seconds": period.real.map(seconds)});
-            (period.class.name().to_string(), told)
-        })
-        .collect();
     let things: Vec<Value> =
         device.things.iter().map(|thing| thing_json(thing, device, now, bus.responding)).collect();
-    json!({
+    let mut value = json!({
         "name": device.name,
         "title": device.title,
         "profile": device.profile,
@@ -161,11 +179,16 @@ pub fn device_json(bus: &BusHealth, device: &DeviceReport, now: Time) -> Value {
         "reason": device.reason,
         "identity": device.identity,
         "last_answer_seconds_ago": device.last_answer_at.map(|at| seconds(now - at)),
-        "periods": periods,
+        "periods": device.periods_json(),
         "counters": counters_json(&device.counters),
+        "exceptions_by_code": codes_json(&device.counters),
         "things": things,
         "drift": drift_json(&device.drift),
-    })
+    });
+    for (name, times) in times_json(&device.timing, false) {
+        value[name] = times;
+    }
+    value
 }
 
 /// As it stands in a device's info, too.
@@ -183,6 +206,27 @@ pub fn drift_json(drift: &[Drift]) -> Value {
 
 fn counters_json(counters: &Counters) -> Map<String, Value> {
     counters.list().into_iter().map(|(name, count)| (name.to_string(), count.into())).collect()
+}
+
+fn codes_json(counters: &Counters) -> Value {
+    let codes: Map<String, Value> =
+        counters.exceptions_by_code().map(|(code, count)| (code, count.into())).collect();
+    codes.into()
+}
+
+/// Percentiles of the last minutes, of commands those of the last days; null where there was nothing. Only
+/// a bus can be late.
+fn times_json(timing: &TimingReport, is_bus: bool) -> Map<String, Value> {
+    let told = timing.list().into_iter().filter(|(name, _)| is_bus || *name != "lateness");
+    told.map(|(name, spread)| {
+        let lately = spread.as_ref().and_then(|spread| spread.lately);
+        let of =
+            |percentile: fn(&Percentiles) -> Duration| lately.as_ref().map(|times| fine(percentile(times)));
+        let told =
+            json!({"p50": of(|times| times.p50), "p95": of(|times| times.p95), "p99": of(|times| times.p99)});
+        (format!("{name}_seconds"), told)
+    })
+    .collect()
 }
 
 /// One point; `is_heard` as in [`PointReport::freshness`].
@@ -229,6 +273,11 @@ fn told_missing<'m>(missing: &'m Option<(&'static str, String)>) -> (Option<&'st
 /// With the digits that mean something.
 pub fn seconds(duration: Duration) -> f64 {
     (duration.as_secs_f64() * 1000.0).round() / 1000.0
+}
+
+/// What is short is told in hundredths of a millisecond.
+fn fine(duration: Duration) -> f64 {
+    (duration.as_secs_f64() * 100_000.0).round() / 100_000.0
 }
 
 fn object(value: Value) -> Map<String, Value> {

@@ -5,10 +5,11 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use serde_json::{Map, Value, json};
 
+use super::diagnostics::Place;
 use super::entity::{Entity, companions, entity, sentence};
 use super::release;
 use super::thing::thing_component;
-use crate::engine::device::Platform;
+use crate::engine::device::{Platform, Poll};
 use crate::engine::settings::{self, DeviceSettings};
 use crate::engine::topics::{self, Message, Topics};
 use crate::engine::units::Release;
@@ -208,6 +209,7 @@ pub fn announcement(
             components.push((thing.name.clone(), component));
         }
     }
+    components.extend(diagnostics(topics, device));
     let about = json!({
         "identifiers": [identity],
         "name": device.title,
@@ -217,6 +219,21 @@ pub fn announcement(
     });
     let availability = [topics.bridge_state(), topics.availability(&device.name)];
     Announcement::new(gateway, &identity, without_empty(about), &availability, components)
+}
+
+/// How the device is on its wire.
+fn diagnostics(topics: &Topics, device: &DeviceSettings) -> Components {
+    let (identity, topic) = (topics.identity(&device.name), topics.health(&device.name));
+    let (entity, key, object) = (&device.name, "wire_", "value_json");
+    let place = Place { identity: &identity, entity, key, topic: &topic, object };
+    let mut components = place.times(&["turnaround_p95"]);
+    for (class, name) in [(Poll::Fast, "Fast period"), (Poll::Slow, "Slow period")] {
+        if device.device.points.iter().any(|point| point.poll == class) {
+            components.push(place.period(class.name(), name, class == Poll::Fast));
+        }
+    }
+    components.extend(place.counters(&["timeouts"]));
+    components
 }
 
 /// The key of the entity that counts the writes to the device's EEPROM, and the info's too.
@@ -368,13 +385,46 @@ mod tests {
                 },
             },
         });
-        assert_eq!(payload(&message), expected);
+        let mut told = payload(&message);
+        // How the device is on its wire is told by another test.
+        let components = told["components"].as_object_mut().expect("an object");
+        components.retain(|key, _| !key.starts_with("wire_"));
+        assert_eq!(told, expected);
+    }
+
+    #[test]
+    fn how_a_device_is_on_its_wire_is_told_by_few_entities_and_by_more_that_can_be_enabled() {
+        let told = payload(&announced(None).message());
+        let components = told["components"].as_object().expect("an object");
+        let wire = || components.iter().filter(|(key, _)| key.starts_with("wire_"));
+        let enabled: Vec<&str> = wire()
+            .filter(|(_, component)| component["enabled_by_default"] != json!(false))
+            .map(|(key, _)| key.as_str())
+            .collect();
+        assert_eq!(enabled, ["wire_turnaround_p95", "wire_fast_period", "wire_timeouts"]);
+        assert_eq!(wire().count(), 14);
+        assert!(wire().all(|(_, component)| component["entity_category"] == "diagnostic"));
+        let expected = json!({
+            "platform": "sensor",
+            "name": "Turnaround, 95 %",
+            "entity_category": "diagnostic",
+            "device_class": "duration",
+            "unit_of_measurement": "s",
+            "state_class": "measurement",
+            "suggested_display_precision": 3,
+            "unique_id": "busker_heating_wire_turnaround_p95",
+            "default_entity_id": "sensor.heating_wire_turnaround_p95",
+            "state_topic": "busker/heating/health",
+            "value_template": "{{ value_json.turnaround_seconds.p95 }}",
+        });
+        assert_eq!(components["wire_turnaround_p95"], expected);
     }
 
     #[test]
     fn what_a_new_case_drops_is_buried_before_the_new_is_announced() {
         let keys = |announcement: &Announcement| {
-            announcement.components().map(|(key, _)| key.to_string()).collect::<Vec<_>>()
+            let keys = announcement.components().map(|(key, _)| key.to_string());
+            keys.filter(|key| !key.starts_with("wire_")).collect::<Vec<_>>()
         };
         assert_eq!(keys(&announced(None)), ["relay", "mode"]);
         assert_eq!(keys(&announced(Some(1))), ["relay", "mode", "input_v"]);

@@ -1,8 +1,9 @@
 //! The gateway itself and its buses in Home Assistant.
 
-use serde_json::{Map, Value, json};
+use serde_json::json;
 
 use super::announcement::{Announcement, Gateway};
+use super::diagnostics::{Place, object};
 use crate::engine::topics::{OFFLINE, ONLINE};
 
 /// The gateway: one entity that says whether it is connected. Announced before all others, which
@@ -45,52 +46,19 @@ pub fn announce_bus(gateway: &Gateway, bus: &str) -> Announcement {
         "model": "Modbus bus",
         "via_device": topics.bridge_identity(),
     });
-    let component = |key: &str, name: &str, template: String, more: Value| {
-        let platform = if key == "link" { "binary_sensor" } else { "sensor" };
-        let mut component = object(json!({
-            "platform": platform,
-            "name": name,
-            "entity_category": "diagnostic",
-            "unique_id": format!("{identity}_{key}"),
-            "default_entity_id": format!("{platform}.{identity}_{key}"),
-            "state_topic": topics.bridge_health(),
-            "value_template": template,
-        }));
-        component.extend(object(more));
-        (key.to_string(), component)
-    };
+    let topic = topics.bridge_health();
     // In brackets: a bus may be called `items`, which is also a method of a mapping.
-    let place = format!("value_json.buses['{bus}']");
-    let of_bus = |expression: &str| format!("{{{{ {} }}}}", expression.replace("BUS", &place));
-    let counter = |key: &str, name: &str| {
-        let more = json!({"state_class": "total_increasing", "suggested_display_precision": 0});
-        component(key, name, of_bus(&format!("BUS.{key}")), more)
-    };
-    let components = vec![
-        component(
-            "link",
-            "Link",
-            of_bus("'ON' if BUS.up else 'OFF'"),
-            json!({"device_class": "connectivity"}),
-        ),
-        component(
-            "load",
-            "Load",
-            of_bus("(BUS.load * 100) | round(1)"),
-            json!({"unit_of_measurement": "%", "state_class": "measurement", "suggested_display_precision": 1}),
-        ),
-        counter("requests", "Requests"),
-        counter("timeouts", "Timeouts"),
-        counter("checksum_errors", "Checksum errors"),
-        counter("exceptions", "Exceptions"),
-        counter("late_replies", "Late replies"),
+    let object = format!("value_json.buses['{bus}']");
+    let place = Place { identity: &identity, entity: &identity, key: "", topic: &topic, object: &object };
+    let link = json!({"device_class": "connectivity"});
+    let load =
+        json!({"unit_of_measurement": "%", "state_class": "measurement", "suggested_display_precision": 1});
+    let mut components = vec![
+        place.entity("binary_sensor", "link", "Link", "'ON' if OBJECT.up else 'OFF'", link),
+        place.entity("sensor", "load", "Load", "(OBJECT.load * 100) | round(1)", load),
     ];
+    let often = ["requests", "timeouts", "checksum_errors", "exceptions", "late_replies"];
+    components.extend(place.counters(&often));
+    components.extend(place.times(&["turnaround_p95", "command_wait_p95"]));
     Announcement::new(gateway, &identity, device, &[topics.bridge_state()], components)
-}
-
-fn object(value: Value) -> Map<String, Value> {
-    match value {
-        Value::Object(map) => map,
-        _ => Map::new(),
-    }
 }

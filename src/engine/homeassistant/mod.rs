@@ -6,6 +6,7 @@
 //! its buses; `release` says it so that an older Home Assistant understands it.
 
 mod announcement;
+mod diagnostics;
 mod entity;
 mod gateway;
 mod release;

@@ -38,7 +38,8 @@ impl DeviceState {
     /// Goes on from what is remembered of the device; returns how often its EEPROM has been written.
     pub(in crate::engine::bus) fn recall(&mut self, memories: &Memories) -> u64 {
         let device = &self.settings.device;
-        let reads = plan::plan(device, self.cost, &[]);
+        // Whatever is measured later: what is refused is remembered for the plan that any start makes.
+        let reads = plan::plan(device, self.tariff.cost(plan::USUAL_TURNAROUND), &[]);
         let memory = memories.devices.get(&self.settings.name).cloned().unwrap_or_default();
         self.keeping.plan = memory::fingerprint(device, &reads);
         self.counters.persistent_writes = memory.persistent_writes;
@@ -48,9 +49,9 @@ impl DeviceState {
         // Another profile asks otherwise, and is refused otherwise.
         if memory.plan == self.keeping.plan {
             self.refused = memory.refused.clone();
-            let reads = plan::plan(device, self.cost, &self.refused);
+            let reads = self.plan();
             let values = &self.values;
-            self.polls.replace(reads, device.wire.intervals, |point| values.is_selector(point));
+            self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
         }
         self.upkeep = Upkeep::new(&self.settings.device, &self.settings.wanted, &memory);
         match &memories.unkept {

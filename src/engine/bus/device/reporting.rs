@@ -3,7 +3,7 @@
 
 use crate::engine::codec;
 use crate::engine::device::{Point, PointIndex, Poll, Thing, ThingKind};
-use crate::engine::health::{DeviceReport, PeriodReport, PointReport, Role, ThingReport, good_for};
+use crate::engine::health::{DeviceReport, PeriodReport, PointReport, Readout, Role, ThingReport, good_for};
 use crate::engine::homeassistant::sentence;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::{Missing, Reading};
@@ -41,11 +41,37 @@ impl DeviceState {
             identity: self.identity.clone(),
             counters: self.counters,
             last_answer_at: self.last_answer_at,
+            timing: self.turnaround.report(now),
             periods: self.report_periods(now),
             points: Vec::new(),
+            readings: Vec::new(),
             things: Vec::new(),
             drift: self.upkeep.drift(),
         }
+    }
+
+    /// The readings that a poll has brought in its time. On a bus that is too slow that time is as long as
+    /// it really takes.
+    pub(in crate::engine::bus) fn readings(&self, now: Time) -> Vec<Readout> {
+        let mut readings = Vec::new();
+        for (read, period) in self.polls.with_periods() {
+            for (point, _) in &read.points {
+                let (details, reading) = (self.details(*point), self.values.reading(*point));
+                let is_fresh = match (self.values.read_at(*point), period) {
+                    (Some(read_at), Some(period)) => now - read_at <= good_for(period),
+                    // What is read once is true as long as the device is there.
+                    (read_at, None) => read_at.is_some(),
+                    (None, _) => false,
+                };
+                if !is_fresh || details.event.is_some() || details.is_button() {
+                    continue;
+                }
+                if let Ok(resolved) = codec::resolve(self.device(), *point, self.known()) {
+                    readings.extend(Readout::of(&details.name, &resolved, reading));
+                }
+            }
+        }
+        readings
     }
 
     fn report_periods(&self, now: Time) -> Vec<PeriodReport> {

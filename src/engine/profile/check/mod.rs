@@ -10,7 +10,7 @@ mod presentation;
 mod things;
 mod writing;
 
-use crate::engine::device::{Device, Encoding, Form, Point};
+use crate::engine::device::{Device, Encoding, Form, Point, TOPICS_OF_EVERY_DEVICE};
 use crate::engine::profile::expand::Expanded;
 use crate::engine::profile::file::{self, Profile};
 use crate::engine::yaml::{At, Faults};
@@ -71,7 +71,7 @@ impl<'a, 'f> Rules<'a, 'f> {
                     ),
                 );
             }
-            if ["availability", "info"].contains(&point.name.as_str()) {
+            if TOPICS_OF_EVERY_DEVICE.contains(&point.name.as_str()) {
                 let name = &point.name;
                 self.faults.add(
                     point.place,

@@ -1,0 +1,137 @@
+//! What a bus and a device say of their wire, as diagnostic entities: few that everybody looks for, and
+//! more that can be enabled.
+
+use serde_json::{Map, Value, json};
+
+/// Whose entities they are, and where what they tell stands.
+pub(super) struct Place<'p> {
+    /// The beginning of each unique id.
+    pub identity: &'p str,
+    /// The beginning of each entity id, behind the platform's dot.
+    pub entity: &'p str,
+    /// The beginning of each key.
+    pub key: &'p str,
+    pub topic: &'p str,
+    /// The expression of the object in it: `value_json`.
+    pub object: &'p str,
+}
+
+/// Entities of this device, in their order.
+pub(super) type Components = Vec<(String, Map<String, Value>)>;
+
+/// How an entity looks, beside what all have.
+enum Looks {
+    /// Counts since the start.
+    Counter,
+    /// Seconds, which may be few thousandths.
+    Seconds,
+}
+
+impl Place<'_> {
+    /// One entity. `value` is an expression of what stands in the object.
+    pub(super) fn entity(
+        &self,
+        platform: &str,
+        key: &str,
+        name: &str,
+        value: &str,
+        more: Value,
+    ) -> (String, Map<String, Value>) {
+        let key = format!("{}{key}", self.key);
+        let mut component = object(json!({
+            "platform": platform,
+            "name": name,
+            "entity_category": "diagnostic",
+            "unique_id": format!("{}_{key}", self.identity),
+            "default_entity_id": format!("{platform}.{}_{key}", self.entity),
+            "state_topic": self.topic,
+            "value_template": format!("{{{{ {} }}}}", value.replace("OBJECT", self.object)),
+        }));
+        component.extend(object(more));
+        (key, component)
+    }
+
+    fn of_wire(
+        &self,
+        key: &str,
+        name: &str,
+        value: &str,
+        looks: Looks,
+        enabled: bool,
+    ) -> (String, Map<String, Value>) {
+        let more = match looks {
+            Looks::Counter => json!({"state_class": "total_increasing", "suggested_display_precision": 0}),
+            Looks::Seconds => json!({
+                "device_class": "duration",
+                "unit_of_measurement": "s",
+                "state_class": "measurement",
+                "suggested_display_precision": 3,
+            }),
+        };
+        let (key, mut component) = self.entity("sensor", key, name, value, more);
+        if !enabled {
+            component.insert("enabled_by_default".into(), false.into());
+        }
+        (key, component)
+    }
+
+    /// What is counted. `often`: those that a person looks at are enabled.
+    pub(super) fn counters(&self, often: &[&str]) -> Components {
+        let names = [
+            ("requests", "Requests"),
+            ("timeouts", "Timeouts"),
+            ("checksum_errors", "Checksum errors"),
+            ("exceptions", "Exceptions"),
+            ("late_replies", "Late replies"),
+            ("wrong_frames", "Wrong frames"),
+            ("noise_bytes", "Discarded bytes"),
+        ];
+        let entity = |(key, name): (&str, &str)| {
+            let value = format!("OBJECT.{key}");
+            let (key, mut component) = self.of_wire(key, name, &value, Looks::Counter, often.contains(&key));
+            if name == "Exceptions" {
+                // Which they were: as attributes, since nobody knows beforehand which there will be.
+                component.insert("json_attributes_topic".into(), self.topic.into());
+                let codes = format!("{{{{ {}.exceptions_by_code | tojson }}}}", self.object);
+                component.insert("json_attributes_template".into(), codes.into());
+            }
+            (key, component)
+        };
+        names.into_iter().map(entity).collect()
+    }
+
+    /// How long things take: of those that a person looks at one percentile is enabled.
+    pub(super) fn times(&self, often: &[&str]) -> Components {
+        let names = [
+            ("turnaround", "Turnaround"),
+            ("gap_wait", "Wait for the line"),
+            ("command_wait", "Wait of commands"),
+        ];
+        let mut components = Components::new();
+        for (key, name) in names {
+            for percentile in ["p50", "p95", "p99"] {
+                let whole = format!("{key}_{percentile}");
+                let title = format!("{name}, {} %", &percentile[1..]);
+                let value = format!("OBJECT.{key}_seconds.{percentile}");
+                let enabled = often.contains(&whole.as_str());
+                if enabled || key == "turnaround" || percentile == "p95" {
+                    components.push(self.of_wire(&whole, &title, &value, Looks::Seconds, enabled));
+                }
+            }
+        }
+        components
+    }
+
+    /// The real period of a poll class.
+    pub(super) fn period(&self, class: &str, name: &str, enabled: bool) -> (String, Map<String, Value>) {
+        let value = format!("OBJECT.periods.{class}.seconds");
+        self.of_wire(&format!("{class}_period"), name, &value, Looks::Seconds, enabled)
+    }
+}
+
+pub(super) fn object(value: Value) -> Map<String, Value> {
+    match value {
+        Value::Object(map) => map,
+        _ => Map::new(),
+    }
+}
