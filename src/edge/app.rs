@@ -144,7 +144,7 @@ impl App {
 pub(super) fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
     mailbox.push(info(settings, topics));
     if settings.home_assistant.discovery {
-        let gateway = Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant);
+        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
         mailbox.push(homeassistant::announce_bridge(&gateway).message());
         for bus in &settings.buses {
             mailbox.push(homeassistant::announce_bus(&gateway, &bus.name).message());

@@ -7,7 +7,7 @@
 use std::num::NonZeroU64;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use tokio::sync::oneshot;
@@ -18,32 +18,23 @@ use crate::edge::guarded_link::{GuardedLink, Woken, wait};
 use crate::edge::link::{Link, Lost};
 use crate::edge::punctual::Punctual;
 use crate::edge::state_files::StateFiles;
-use crate::engine::bus::{Action, Bus, Event, Severity};
+use crate::engine::bus::{Action, Bus, Command, Event, Full, Inbox, Severity};
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::settings::Settings;
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
 
-/// Commands and questions that may wait for the thread. The loop takes all of them between two
-/// looks at the line, so this fills only when something floods it; then [`Full`] is returned.
-const WAITING_MAX: usize = 256;
+/// Looks that may wait for the thread.
+const LOOKS_MAX: usize = 64;
 
 /// Talks to a bus's thread. Dropping it does not stop the thread.
 pub struct BusHandle {
-    letters: SyncSender<Letter>,
+    inbox: Arc<Mutex<Inbox>>,
+    looks: SyncSender<Look>,
     bell: Bell,
     stop: Arc<AtomicBool>,
     thread: Mutex<Option<JoinHandle<()>>>,
-}
-
-/// Too much waits for the bus already; what was to be sent is dropped.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Full;
-
-enum Letter {
-    Event(Event),
-    Inspect(Look),
 }
 
 /// Something that looks at the bus on its thread.
@@ -58,7 +49,9 @@ pub fn start(
     state: Arc<StateFiles>,
     publish: Box<dyn Fn(Message) + Send>,
 ) -> std::io::Result<BusHandle> {
-    let (letters, inbox) = sync_channel(WAITING_MAX);
+    let inbox = Arc::<Mutex<Inbox>>::default();
+    let thread_inbox = inbox.clone();
+    let (looks, looks_in) = sync_channel(LOOKS_MAX);
     let bell = Bell::new()?;
     let stop = Arc::new(AtomicBool::new(false));
     let (thread_bell, thread_stop) = (bell.clone(), stop.clone());
@@ -76,7 +69,8 @@ pub fn start(
                 publish,
                 bus,
                 port,
-                inbox,
+                inbox: thread_inbox,
+                looks: looks_in,
                 bell,
                 stop,
                 stopping,
@@ -84,13 +78,15 @@ pub fn start(
             }
             .run();
         })?;
-    Ok(BusHandle { letters, bell, stop, thread: Mutex::new(Some(thread)) })
+    Ok(BusHandle { inbox, looks, bell, stop, thread: Mutex::new(Some(thread)) })
 }
 
 impl BusHandle {
-    /// Hands an event to the bus.
-    pub fn send(&self, event: Event) -> Result<(), Full> {
-        self.post(Letter::Event(event))
+    /// Hands an event to the bus; returns the command whose place it took, if it did.
+    pub fn send(&self, event: Event) -> Result<Option<Command>, Full> {
+        let result = lock(&self.inbox).push(event);
+        self.bell.ring();
+        result
     }
 
     /// Runs `look` on the bus's thread, at once, even while a request is in flight. The receiver
@@ -105,7 +101,8 @@ impl BusHandle {
             let _ = sender.send(look(bus, now));
         };
         // What does not fit drops the sender, which the receiver notices.
-        let _ = self.post(Letter::Inspect(Box::new(look)));
+        let _ = self.looks.try_send(Box::new(look));
+        self.bell.ring();
         receiver
     }
 
@@ -124,12 +121,11 @@ impl BusHandle {
             }
         }
     }
+}
 
-    fn post(&self, letter: Letter) -> Result<(), Full> {
-        let result = self.letters.try_send(letter).map_err(|_| Full);
-        self.bell.ring();
-        result
-    }
+fn lock(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
+    // It is whole after every call, whoever panicked meanwhile.
+    inbox.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The link, from closed to open and back.
@@ -150,7 +146,8 @@ struct BusThread {
     publish: Box<dyn Fn(Message) + Send>,
     bus: Bus,
     port: Port,
-    inbox: Receiver<Letter>,
+    inbox: Arc<Mutex<Inbox>>,
+    looks: Receiver<Look>,
     bell: Bell,
     stop: Arc<AtomicBool>,
     stopping: bool,
@@ -181,7 +178,9 @@ impl BusThread {
     }
 
     fn handle(&mut self, event: Event) {
-        self.bus.handle(self.clock.now(), event);
+        let now = self.clock.now();
+        self.bus.set_date(now, self.clock.today());
+        self.bus.handle(now, event);
         self.perform();
     }
 
@@ -248,14 +247,17 @@ impl BusThread {
 
     fn read_letters(&mut self) {
         // At most as many as can wait, so that a flood does not keep the line waiting.
-        for _ in 0..WAITING_MAX {
-            match self.inbox.try_recv() {
-                Ok(Letter::Event(event)) => self.handle(event),
-                Ok(Letter::Inspect(look)) => look(&self.bus, self.clock.now()),
-                Err(TryRecvError::Empty | TryRecvError::Disconnected) => return,
-            }
+        for _ in 0..Inbox::LIMIT {
+            let event = lock(&self.inbox).take();
+            let Some(event) = event else { break };
+            self.handle(event);
         }
-        self.bell.ring();
+        if !lock(&self.inbox).is_empty() {
+            self.bell.ring();
+        }
+        while let Ok(look) = self.looks.try_recv() {
+            look(&self.bus, self.clock.now());
+        }
     }
 
     fn stop_if_asked(&mut self) {
@@ -321,6 +323,13 @@ impl BusThread {
     fn lose(&mut self, Lost(reason): Lost) {
         self.port = Port::Closed;
         self.handle(Event::LinkDown(reason));
+    }
+}
+
+impl Drop for BusThread {
+    /// Also when it ends in a panic: what is sent to it now is refused, and not left to wait for ever.
+    fn drop(&mut self) {
+        lock(&self.inbox).close();
     }
 }
 

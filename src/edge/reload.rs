@@ -148,7 +148,7 @@ impl App {
                 _ => {
                     let mailbox = self.plant.mailbox();
                     if settings.home_assistant.discovery {
-                        let gateway = Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant);
+                        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
                         mailbox.push(homeassistant::announce_bus(&gateway, name).message());
                     }
                     let bus = start_bus(&settings_of_threads, index, self.clock, &self.state, mailbox);

@@ -2,16 +2,19 @@
 //! messages that are told once. The client library forgets what it has not sent when the connection
 //! breaks; this does not.
 
+mod manner;
 mod reconfigure;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::settings::Manner;
 use crate::engine::time::{Duration, Time};
-use crate::engine::topics::{self, Message, OFFLINE, ONLINE, Topics};
+use crate::engine::topics::{self, Kind, Message, OFFLINE, ONLINE, Topics};
 
-/// Messages told once that may wait; more push out the oldest.
-const ONCE_MAX: usize = 256;
+/// Messages told once that may wait; more push out the oldest. A slider that is dragged has a thousand outcomes
+/// in a moment, and each of them is told.
+const ONCE_MAX: usize = 2000;
 
 /// The empty queue keeps room for so many.
 const QUEUE_KEPT: usize = 1024;
@@ -30,6 +33,8 @@ const PERIOD: Duration = Duration::from_millis(200);
 #[derive(Clone, Debug)]
 pub struct Outbox {
     topics: Topics,
+    /// How values are told.
+    values: Manner,
     /// Topics that begin so are discovery.
     discovery_prefix: String,
     /// The discovery topics of all that this gateway has, announced already or not.
@@ -56,6 +61,8 @@ struct Retained {
     payload: String,
     queued: bool,
     number: u64,
+    /// The broker may keep a value of an earlier run, which nobody would replace.
+    kept: bool,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -78,6 +85,7 @@ impl Outbox {
         let own = identities.into_iter().map(|identity| topics::discovery(discovery_prefix, &identity));
         Outbox {
             topics,
+            values: Manner::default(),
             discovery_prefix: format!("{discovery_prefix}/device/"),
             own_devices: own.collect(),
             remembered: BTreeMap::new(),
@@ -136,6 +144,10 @@ impl Outbox {
                 Queued::Removal(topic) => return Some(Message::retained(topic, "")),
                 Queued::Newest(topic) => {
                     if let Some(entry) = self.retained.get_mut(&topic) {
+                        if std::mem::take(&mut entry.kept) {
+                            self.queue.push_front(Queued::Newest(topic.clone()));
+                            return Some(Message::retained(topic, ""));
+                        }
                         entry.queued = false;
                         return Some(Message::retained(topic, entry.payload.clone()));
                     }
@@ -151,6 +163,7 @@ impl Outbox {
             self.once_waiting += 1;
             self.queue.push_front(Queued::Once(message));
         } else if let Some(entry) = self.retained.get_mut(&message.topic) {
+            entry.kept |= message.payload.is_empty();
             // A newer value that came meanwhile stands in the queue already.
             if !entry.queued {
                 entry.queued = true;
@@ -164,6 +177,11 @@ impl Outbox {
     /// Messages told once, in their order, that were handed over and did not arrive: they are next
     /// again, as far as there is room.
     pub fn give_back(&mut self, messages: Vec<Message>) {
+        // A value that is not retained waits already.
+        let is_value = |message: &Message| {
+            self.topics.kind(&message.topic) == Kind::Value && self.retained.contains_key(&message.topic)
+        };
+        let messages: Vec<Message> = messages.into_iter().filter(|message| !is_value(message)).collect();
         for message in messages.into_iter().rev() {
             if self.once_waiting < ONCE_MAX {
                 self.put_back(message);
@@ -289,9 +307,10 @@ impl Outbox {
 
     fn push_retained(&mut self, message: Message) {
         let number = self.next_number;
+        let kept = !self.values.retain && self.topics.kind(&message.topic) == Kind::Value;
         let entry = self.retained.entry(message.topic.clone()).or_insert_with(|| {
             self.next_number += 1;
-            Retained { payload: String::new(), queued: false, number }
+            Retained { payload: String::new(), queued: false, number, kept }
         });
         entry.payload = message.payload;
         if !entry.queued {
@@ -346,13 +365,12 @@ impl Outbox {
         if topic.starts_with(&self.discovery_prefix) {
             return Rank::Discovery;
         }
-        let below = topic.strip_prefix(self.topics.base()).unwrap_or(topic);
-        match below.trim_start_matches('/').split_once('/') {
-            Some(("bridge", "state")) => Rank::BridgeState,
-            Some(("bridge", _)) => Rank::Bridge,
-            Some((_, "availability")) => Rank::Availability,
-            Some((_, "info")) => Rank::Info,
-            _ => Rank::State,
+        match self.topics.kind(topic) {
+            Kind::BridgeState => Rank::BridgeState,
+            Kind::Bridge => Rank::Bridge,
+            Kind::Availability => Rank::Availability,
+            Kind::Info => Rank::Info,
+            Kind::Value | Kind::Other => Rank::State,
         }
     }
 }

@@ -1,6 +1,8 @@
 //! The whole program between simulated devices and a real broker.
 
 mod faults;
+mod floods;
+mod manners;
 mod neighbours;
 mod proxy;
 mod reload;

@@ -11,8 +11,9 @@ use super::poller::Seen;
 use crate::edge::clock::Clock;
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::health::BrokerReport;
+use crate::engine::settings::Manner;
 use crate::engine::time::Duration;
-use crate::engine::topics::{Incoming, Message, ONLINE, Topics};
+use crate::engine::topics::{self, Incoming, Message, ONLINE, Topics};
 
 /// What the broker has to tell the rest of the program.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -155,11 +156,11 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             return;
         }
         match self.topics.parse(topic) {
-            Some(Incoming::Set { device, point }) if !retained && stale.is_some() => {
+            Some(Incoming::Set { .. }) if !retained && stale.is_some() => {
                 let reason = stale.unwrap_or_default();
                 tracing::warn!("`{topic}` is not obeyed: {reason}");
                 let outcome = Outcome::new(OutcomeKind::Expired, &payload, &reason);
-                let topic = self.topics.outcome(device, point);
+                let topic = topics::outcome_of(topic);
                 self.mailbox.outbox().push(Message::once(topic, outcome.to_json()));
             }
             Some(Incoming::Set { device, point }) => {
@@ -187,8 +188,9 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         }
         let mut outbox = self.mailbox.outbox();
         while let Some(message) = outbox.next_message(self.clock.now()) {
-            let payload = message.payload.as_bytes();
-            let taken = self.client.try_publish(&message.topic, QoS::AtLeastOnce, message.retain, payload);
+            let Manner { confirmed, retain } = outbox.manner(&message);
+            let qos = if confirmed { QoS::AtLeastOnce } else { QoS::AtMostOnce };
+            let taken = self.client.try_publish(&message.topic, qos, retain, message.payload.as_bytes());
             if taken.is_err() {
                 outbox.put_back(message);
                 return false;

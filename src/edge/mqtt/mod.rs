@@ -72,7 +72,7 @@ impl Broker {
         mailbox: Arc<Mailbox>,
         tell: impl Fn(News) + Send + 'static,
     ) -> Broker {
-        let topics = Topics::new(&settings.mqtt.base_topic);
+        let topics = Topics::of(&settings.mqtt);
         let options = options(&settings.mqtt, &topics, secrets);
         let client_id = options.client_id();
         let (client, event_loop) = AsyncClient::new(options, IN_FLIGHT);

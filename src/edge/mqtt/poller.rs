@@ -153,7 +153,7 @@ mod tests {
     use rumqttc::{AsyncClient, MqttOptions, QoS, StateError};
 
     use super::*;
-    use crate::engine::settings::Password;
+    use crate::engine::settings::{Layout, Manner, Password};
 
     /// The library keeps such a message, and would hand it out after the next connect.
     #[test]
@@ -174,6 +174,9 @@ mod tests {
                 username: None,
                 password: Password::None,
                 base_topic: "busker".into(),
+                topics: Layout::default(),
+                values: Manner::default(),
+                json: false,
             };
             let mut poller = Poller {
                 event_loop,

@@ -43,7 +43,7 @@ impl Bus {
         let Some((device, target)) = self.find(&command.device, &command.point) else { return };
         if command.retained {
             if self.devices[device].warn_of_retained(target) {
-                let topic = self.context.gateway.topics.set(&command.device, &command.point);
+                let topic = self.context.topics_of(&command.device).set(&command.point);
                 self.context
                     .say(Severity::Warning, format!("a retained message on `{topic}` is ignored; delete it"));
             }
@@ -289,7 +289,7 @@ impl Bus {
             return;
         }
         let state = &self.devices[device];
-        let topic = self.context.gateway.topics.outcome(state.name(), state.name_of(target));
+        let topic = self.context.topics_of(state.name()).outcome(state.name_of(target));
         self.context.publish(Message::once(topic, outcome.to_json()));
     }
 

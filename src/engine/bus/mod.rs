@@ -8,8 +8,10 @@
 
 mod change;
 mod commands;
+mod context;
 mod device;
 mod fetch;
+mod inbox;
 mod pause;
 mod requests;
 mod waiting;
@@ -19,19 +21,21 @@ use std::collections::VecDeque;
 use crate::engine::command;
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
-use crate::engine::homeassistant::Gateway;
 use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Cost;
 use crate::engine::request;
 use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settings};
-use crate::engine::time::{Duration, Time};
+use crate::engine::time::{Date, Duration, Time};
 use crate::engine::topics::Message;
 
 use commands::{Active, Settling};
+use context::Context;
 use device::{DeviceState, Polled, Turn};
 use fetch::Fetch;
+pub use inbox::{Full, Inbox};
 use requests::Requests;
+pub use waiting::REPLACED;
 use waiting::{Target, WaitingCommands};
 
 /// After so many requests in a row that nobody answers, a TCP connection is made anew.
@@ -148,25 +152,6 @@ pub struct Bus {
     now: Time,
 }
 
-/// What everything on a bus shares: where messages go, and the actions that wait to be taken.
-struct Context {
-    actions: VecDeque<Action>,
-    gateway: Gateway,
-    discovery: bool,
-    bus_name: String,
-    republish: Duration,
-}
-
-impl Context {
-    fn publish(&mut self, message: Message) {
-        self.actions.push_back(Action::Publish(message));
-    }
-
-    fn say(&mut self, severity: Severity, text: String) {
-        self.actions.push_back(Action::Say(severity, text));
-    }
-}
-
 #[derive(Clone, Debug, PartialEq)]
 enum LinkState {
     Up,
@@ -214,13 +199,7 @@ impl Bus {
     /// of them.
     pub fn new(now: Time, settings: &Settings, index: usize, memories: &Memories) -> Bus {
         let bus = &settings.buses[index];
-        let mut context = Context {
-            actions: VecDeque::from([Action::Reopen { after: Duration::ZERO }]),
-            gateway: Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant),
-            discovery: settings.home_assistant.discovery,
-            bus_name: bus.name.clone(),
-            republish: settings.republish,
-        };
+        let mut context = Context::new(settings, &bus.name);
         let cost = cost(&bus.link);
         let of_bus = settings.devices.iter().filter(|device| device.bus == index);
         let mut devices: Vec<DeviceState> =
@@ -293,7 +272,15 @@ impl Bus {
             self.ask_next();
         }
         self.end_refreshes();
+        if self.context.json {
+            self.devices.iter_mut().for_each(|device| device.tell_whole(now, &mut self.context));
+        }
         self.remember();
+    }
+
+    /// Says what date it is, for texts: nothing is decided by it, and it may jump.
+    pub fn set_date(&mut self, now: Time, date: Date) {
+        self.context.date = Some((now, date));
     }
 
     /// Takes the next thing to do, until there is none.
@@ -304,7 +291,8 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let records = self.record_due_at.into_iter();
+        let wholes = self.devices.iter().filter(|_| self.context.json).filter_map(DeviceState::whole_due_at);
+        let records = self.record_due_at.into_iter().chain(wholes);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
             return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
         }

@@ -203,7 +203,7 @@ impl DeviceState {
         self.after_news(now, context);
         if self.details(point).persistent && self.is_present() {
             // How often the EEPROM has been written stands there.
-            self.tell_info(context);
+            self.tell_info(now, context);
         }
     }
 }
