@@ -40,12 +40,17 @@ impl App {
             Some(listen) if moves => Some(self.runtime.block_on(Http::bind(listen))?),
             Some(_) | None => None,
         };
+        let names = || settings.devices.iter().map(|device| device.name.as_str());
+        let state = match old.state_dir == settings.state_dir {
+            true => None,
+            false => Some(StateFiles::open(&settings.state_dir, names())?),
+        };
         let http_ends = old.http != settings.http || keys.token != self.keys.token;
         let listen = settings.http.listen.clone();
         match change {
             Change::Everything => {
                 tracing::info!("the new configuration changes what everything is made of: all begins anew");
-                self.begin_anew(&old, settings, library, keys, secrets)?;
+                self.begin_anew(state, settings, library, keys, secrets)?;
             }
             Change::Parts(parts) => {
                 if parts.is_nothing() && keys == self.keys {
@@ -74,7 +79,7 @@ impl App {
 
     fn begin_anew(
         &mut self,
-        old: &Settings,
+        state: Option<StateFiles>,
         settings: Settings,
         library: Library,
         keys: Keys,
@@ -86,12 +91,12 @@ impl App {
         if let Some(broker) = self.broker.take() {
             self.runtime.block_on(broker.finish());
         }
-        let names = || settings.devices.iter().map(|device| device.name.as_str());
-        if old.state_dir == settings.state_dir {
-            self.state.learn(names());
-        } else {
-            self.state.finish();
-            self.state = Arc::new(StateFiles::open(&settings.state_dir, names())?);
+        match state {
+            Some(state) => {
+                self.state.finish();
+                self.state = Arc::new(state);
+            }
+            None => drop(self.state.learn(settings.devices.iter().map(|device| device.name.as_str()))),
         }
         let everyone = 0..settings.buses.len();
         self.plant.begin_anew(settings, library);

@@ -10,7 +10,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
+use rustix::fs::FlockOperation;
+use rustix::io::Errno;
 
 use crate::engine::memory::{Memories, Memory, Record};
 use crate::engine::time::Duration;
@@ -28,6 +30,8 @@ pub struct StateFiles {
     desk: Arc<Desk>,
     thread: Mutex<Option<JoinHandle<()>>>,
     keeps: bool,
+    /// Held as long as this lives.
+    _lock: Option<File>,
 }
 
 /// What lies on it waits to be stored: the newest of each device.
@@ -46,10 +50,10 @@ struct Waiting {
 impl StateFiles {
     /// Keeps nothing, and remembers nothing.
     pub fn nowhere() -> StateFiles {
-        StateFiles::unkept(Memories { unkept: Some("nothing is kept".into()), ..Memories::default() })
+        StateFiles::unkept(Memories { unkept: Some("nothing is kept".into()), ..Memories::default() }, None)
     }
 
-    fn unkept(memories: Memories) -> StateFiles {
+    fn unkept(memories: Memories, lock: Option<File>) -> StateFiles {
         StateFiles {
             damaged: Mutex::default(),
             memories: Mutex::new(memories),
@@ -57,13 +61,15 @@ impl StateFiles {
             desk: Arc::default(),
             thread: Mutex::default(),
             keeps: false,
+            _lock: lock,
         }
     }
 
     /// Reads what is remembered of these devices in `state_dir`. What is wrong with the files goes to
-    /// the log, and the gateway runs without them.
+    /// the log, and the gateway runs without them. An error means that another gateway has them.
     pub fn open<'d>(state_dir: &Path, devices: impl Iterator<Item = &'d str>) -> anyhow::Result<StateFiles> {
         let folder = state_dir.join("devices");
+        let lock = lock_folder(state_dir)?;
         let mut memories = Memories::default();
         let mut unknown = Vec::new();
         for device in devices {
@@ -86,7 +92,7 @@ impl StateFiles {
                 "{reason}; counts of EEPROM writes end with this run, and `settings` are only compared, \
                  except where they are enforced"
             );
-            return Ok(StateFiles::unkept(memories));
+            return Ok(StateFiles::unkept(memories, lock));
         }
         let desk = Arc::<Desk>::default();
         let (of_thread, of_files) = (desk.clone(), folder.clone());
@@ -101,6 +107,7 @@ impl StateFiles {
             desk,
             thread: Mutex::new(Some(thread)),
             keeps: true,
+            _lock: lock,
         })
     }
 
@@ -259,6 +266,38 @@ fn keep_aside(path: &Path) -> io::Result<PathBuf> {
     Err(io::Error::other("there are 99 damaged ones already"))
 }
 
+/// Two gateways with one folder would each count as if the other wrote nothing: the second one does not start.
+/// `None` where there can be no lock, since the folder cannot be written (which is told elsewhere) or its
+/// file system knows none.
+fn lock_folder(state_dir: &Path) -> anyhow::Result<Option<File>> {
+    let path = state_dir.join("lock");
+    let open = || File::options().read(true).write(true).create(true).truncate(false).open(&path);
+    let Ok(mut file) = fs::create_dir_all(state_dir).and_then(|()| open()) else { return Ok(None) };
+    let shown = state_dir.display();
+    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => {
+            // Only for who is refused; without it the lock holds all the same.
+            let told = file.set_len(0).and_then(|()| writeln!(file, "{}", std::process::id()));
+            if let Err(error) = told {
+                tracing::debug!("`{}` cannot be written: {error}", path.display());
+            }
+            Ok(Some(file))
+        }
+        Err(Errno::WOULDBLOCK) => {
+            let holder = fs::read_to_string(&path).unwrap_or_default();
+            let holder = holder.trim().parse::<u32>().map_or(String::new(), |id| format!(" (process {id})"));
+            bail!(
+                "another busker{holder} keeps its state in `{shown}`; end it, or give each a `state_dir` and a \
+                 `base_topic` of its own"
+            )
+        }
+        Err(error) => {
+            tracing::warn!("`{shown}` cannot be locked ({error}); see to it that no other busker uses it");
+            Ok(None)
+        }
+    }
+}
+
 /// Whether files can be made in `folder`, which is made if it is not there.
 fn probe(folder: &Path) -> io::Result<()> {
     fs::create_dir_all(folder)?;
@@ -311,6 +350,21 @@ mod tests {
         assert_eq!(files.memories().unkept, None);
         drop(files);
         assert_eq!(names(&folder.path().join("devices")), ["one.json"]);
+    }
+
+    #[test]
+    fn a_folder_is_used_by_one_gateway_at_a_time() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let open = || StateFiles::open(folder.path(), ["one"].into_iter());
+        let first = open().expect("it is free");
+        let refused = open().err().expect("it is taken").to_string();
+        let holder = format!("another busker (process {}) keeps its state in `", std::process::id());
+        assert!(refused.starts_with(&holder), "{refused}");
+        drop(first);
+        drop(open().expect("it is free again"));
+        // What a process that was killed has left there holds nothing.
+        fs::write(folder.path().join("lock"), "123456").expect("a file");
+        drop(open().expect("it is free"));
     }
 
     #[test]

@@ -255,6 +255,15 @@ impl Gateway {
         kill_process(Pid::from_child(&self.child), Signal::CONT).expect("the signal is sent");
     }
 
+    /// Its configuration file, and what it runs as.
+    pub fn file(&self) -> PathBuf {
+        self.folder.path().join("busker.yaml")
+    }
+
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Puts another configuration in the place of its own, as for [`Gateway::start_with`].
     pub fn write(&self, rest: &str) {
         write_configuration(&self.folder, rest);
