@@ -50,6 +50,16 @@ impl Bus {
             return;
         }
         let is_press = self.devices[device].is_press(target);
+        if is_press {
+            if let Some(reason) = self.devices[device].is_too_soon(self.now, target) {
+                self.tell_outcome(
+                    device,
+                    target,
+                    Outcome::new(OutcomeKind::Refused, &command.payload, reason),
+                );
+                return;
+            }
+        }
         let waiting = Waiting::new(self.now, device, target, command.payload, is_press);
         for (replaced, reason) in self.waiting.push(waiting) {
             let outcome = Outcome::new(OutcomeKind::Expired, &replaced.wanted, reason);
