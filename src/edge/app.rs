@@ -44,7 +44,7 @@ pub struct App {
     pub(super) http: Option<Http>,
     pub(super) reporter: Arc<Reporter>,
     pub(super) state: Arc<StateFiles>,
-    watch: JoinHandle<()>,
+    pub(super) watch: JoinHandle<()>,
 }
 
 /// What the settings name and does not stand in them. It may change while they do not.
@@ -87,6 +87,7 @@ impl App {
             None => None,
         };
         let plant = Arc::new(Plant::new(settings, library, clock));
+        recall(&plant, &state);
         introduce(&plant.settings(), &plant.topics(), &plant.mailbox());
         let everyone = 0..plant.settings().buses.len();
         let buses = start_buses(&plant, everyone, clock, &state)?;
@@ -99,7 +100,7 @@ impl App {
         let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched));
         let http =
             listener.map(|listener| Http::serve(listener, reporter.clone(), clock, keys.token.clone()));
-        let watch = tokio::spawn(watch(reporter.clone(), plant.clone()));
+        let watch = tokio::spawn(watch(reporter.clone(), plant.clone(), state.clone()));
         Ok(App { runtime, clock, plant, broker: Some(broker), keys, http, reporter, state, watch })
     }
 
@@ -137,6 +138,15 @@ impl App {
         // A stuck bus's thread is not waited for again.
         self.runtime.shutdown_background();
         self.state.finish();
+    }
+}
+
+/// What Home Assistant still has of an earlier run, whatever the broker has forgotten.
+fn recall(plant: &Plant, state: &StateFiles) {
+    if plant.settings().home_assistant.discovery {
+        plant.mailbox().change(|outbox| {
+            state.announced().iter().for_each(|(topic, payload)| outbox.recall(topic, payload));
+        });
     }
 }
 
@@ -236,7 +246,7 @@ pub(super) fn watched(
 
 /// Looks at the gateway again and again: tells its health, and feeds systemd's watchdog while every
 /// bus answers.
-async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
+pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc<StateFiles>) {
     let every = shutdown::watchdog_interval().map_or(LOOK_EVERY, |interval| interval.min(LOOK_EVERY));
     let mut ticks = tokio::time::interval(every);
     let rounds = TELL_HEALTH_EVERY.as_millis() / every.as_millis().max(1);
@@ -253,6 +263,9 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
         if round % rounds.max(1) == 0 || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
+        }
+        if report.broker.connected && plant.settings().home_assistant.discovery {
+            mailbox.look(|outbox| outbox.announced().iter().for_each(|told| state.store_announced(told)));
         }
         let info = plant.info(&report);
         if told_info != info {

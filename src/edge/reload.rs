@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::Context;
 
 use crate::edge::app::{
-    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, start_bus, start_buses, watched,
+    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, start_bus, start_buses, watch, watched,
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
@@ -95,6 +95,9 @@ impl App {
             Some(state) => {
                 self.state.finish();
                 self.state = Arc::new(state);
+                self.watch.abort();
+                let watch = watch(self.reporter.clone(), self.plant.clone(), self.state.clone());
+                self.watch = self.runtime.spawn(watch);
             }
             None => drop(self.state.learn(settings.devices.iter().map(|device| device.name.as_str()))),
         }

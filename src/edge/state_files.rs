@@ -20,6 +20,9 @@ use crate::engine::time::Duration;
 /// What could not be stored is tried again after this.
 const TRY_AGAIN_AFTER: Duration = Duration::from_secs(60);
 
+/// What Home Assistant has been told of this gateway, in `state_dir`.
+const ANNOUNCED: &str = "announced.json";
+
 /// What was remembered at the start, and where to put what is to be remembered.
 pub struct StateFiles {
     /// The newest of each device.
@@ -30,6 +33,8 @@ pub struct StateFiles {
     desk: Arc<Desk>,
     thread: Mutex<Option<JoinHandle<()>>>,
     keeps: bool,
+    /// What Home Assistant was last told, by topic, as it is stored.
+    announced: Mutex<BTreeMap<String, String>>,
     /// Held as long as this lives.
     _lock: Option<File>,
 }
@@ -44,6 +49,7 @@ struct Desk {
 #[derive(Default)]
 struct Waiting {
     memories: BTreeMap<String, Memory>,
+    announced: Option<String>,
     finish: bool,
 }
 
@@ -61,6 +67,7 @@ impl StateFiles {
             desk: Arc::default(),
             thread: Mutex::default(),
             keeps: false,
+            announced: Mutex::default(),
             _lock: lock,
         }
     }
@@ -107,6 +114,7 @@ impl StateFiles {
             desk,
             thread: Mutex::new(Some(thread)),
             keeps: true,
+            announced: Mutex::new(recall_announced(&state_dir.join(ANNOUNCED))),
             _lock: lock,
         })
     }
@@ -147,6 +155,23 @@ impl StateFiles {
         }
     }
 
+    /// What an earlier run has told Home Assistant, by topic.
+    pub fn announced(&self) -> BTreeMap<String, String> {
+        lock(&self.announced).clone()
+    }
+
+    /// Keeps what Home Assistant has been told, if it is not what is kept. Does not wait for that.
+    pub fn store_announced(&self, told: &BTreeMap<&str, &str>) {
+        let mut announced = lock(&self.announced);
+        let as_stored = announced.iter().map(|(topic, payload)| (topic.as_str(), payload.as_str()));
+        if !self.keeps || as_stored.eq(told.iter().map(|(topic, payload)| (*topic, *payload))) {
+            return;
+        }
+        *announced = told.iter().map(|(topic, payload)| (topic.to_string(), payload.to_string())).collect();
+        self.desk.lock().announced = Some(serde_json::json!(*announced).to_string());
+        self.desk.changed.notify_all();
+    }
+
     /// Waits until everything is stored; the end.
     pub fn finish(&self) {
         self.desk.lock().finish = true;
@@ -172,7 +197,14 @@ impl Desk {
     fn work(&self, folder: &Path) {
         let mut failed = false;
         loop {
-            let (memories, finish) = self.take(failed);
+            let (memories, announced, finish) = self.take(failed);
+            if let Some(text) = announced {
+                let path = folder.with_file_name(ANNOUNCED);
+                if let Err(error) = replace(&path, &text) {
+                    // The broker most likely remembers it too.
+                    tracing::warn!("`{}` cannot be stored: {error}", path.display());
+                }
+            }
             for (device, memory) in memories {
                 match replace(&file_of(folder, &device), &memory.to_text()) {
                     Ok(()) if failed => {
@@ -201,17 +233,19 @@ impl Desk {
     }
 
     /// Waits for something to store, or for the end. After a failure, what waits may wait.
-    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, bool) {
+    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, Option<String>, bool) {
         let mut waiting = self.lock();
         if failed && !waiting.finish {
             let until_finish = |waiting: &mut Waiting| !waiting.finish;
             let waited = self.changed.wait_timeout_while(waiting, TRY_AGAIN_AFTER, until_finish);
             waiting = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
-        let nothing_to_do = |waiting: &mut Waiting| waiting.memories.is_empty() && !waiting.finish;
+        let nothing_to_do = |waiting: &mut Waiting| {
+            waiting.memories.is_empty() && waiting.announced.is_none() && !waiting.finish
+        };
         let mut waiting =
             self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
-        (std::mem::take(&mut waiting.memories), waiting.finish)
+        (std::mem::take(&mut waiting.memories), waiting.announced.take(), waiting.finish)
     }
 }
 
@@ -249,6 +283,19 @@ fn recall(path: &Path) -> Result<Option<Memory>, String> {
         }
         Err(error) => Err(format!("`{shown}` cannot be used ({reason}) and cannot be kept aside ({error})")),
     }
+}
+
+/// What an earlier run has told Home Assistant; nothing if that is not known: the broker most likely does.
+fn recall_announced(path: &Path) -> BTreeMap<String, String> {
+    let read = match fs::read_to_string(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return BTreeMap::new(),
+        Err(error) => Err(error.to_string()),
+        Ok(text) => serde_json::from_str(&text).map_err(|error| error.to_string()),
+    };
+    read.unwrap_or_else(|reason| {
+        tracing::warn!("`{}` cannot be used ({reason}) and will be written anew", path.display());
+        BTreeMap::new()
+    })
 }
 
 /// Renames a damaged file to one with `.broken` behind its name, which replaces no other.
@@ -390,6 +437,26 @@ mod tests {
         files.store(Record { device: "four".into(), memory: memory(1) });
         drop(files);
         assert!(devices.join("four.json").is_dir(), "it is not overwritten");
+    }
+
+    #[test]
+    fn what_was_announced_is_there_after_a_restart() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let open = || StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
+        let path = folder.path().join(ANNOUNCED);
+        let files = open();
+        assert_eq!(files.announced(), BTreeMap::new());
+        files.store_announced(&BTreeMap::from([("a/config", "{}")]));
+        drop(files);
+        let files = open();
+        assert_eq!(files.announced(), BTreeMap::from([("a/config".to_string(), "{}".to_string())]));
+        // What is the same is not written again: it may lie on a memory card.
+        fs::remove_file(&path).expect("it is there");
+        files.store_announced(&BTreeMap::from([("a/config", "{}")]));
+        drop(files);
+        assert!(!path.exists());
+        fs::write(&path, "{\"a/config\": 7").expect("a file");
+        assert_eq!(open().announced(), BTreeMap::new(), "a damaged one is as none");
     }
 
     #[test]

@@ -4,6 +4,7 @@ mod faults;
 mod floods;
 mod manners;
 mod neighbours;
+mod orphans;
 mod proxy;
 mod reload;
 mod requests;

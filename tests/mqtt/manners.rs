@@ -105,6 +105,7 @@ fn a_device_tells_all_it_says_in_one_message_and_not_more_than_once_a_second() {
     let watcher = Watcher::start(&broker, "watcher");
     let _gateway = start(&broker, "json: true", &format!("tcp: '{}'", port.address()));
     let whole = |got: &Received| got.topic == "busker/relays";
+    let counter = Watcher::start(&broker, "counter");
     watcher.wait_until("all of it", |got| whole(got) && json(&got.payload)["watchdog"] == 0.0);
     for round in 0..12 {
         watcher.forget();
@@ -123,6 +124,10 @@ fn a_device_tells_all_it_says_in_one_message_and_not_more_than_once_a_second() {
             });
         }
     }
+    let told: Vec<Received> =
+        counter.received().into_iter().filter(|got| whole(got) && !got.retained).collect();
+    let took = told[told.len() - 1].at - told[0].at;
+    assert!(told.len() as u64 <= 2 + took.as_secs(), "{} in {took:?}", told.len());
     let later = Watcher::start(&broker, "later");
     let last = later.wait_until("all of it", whole);
     assert_eq!(json(&last.payload)["relay_1"], "OFF");

@@ -30,6 +30,11 @@ impl Mailbox {
         self.news.notify_one();
     }
 
+    /// Looks at what waits or is remembered.
+    pub fn look<T>(&self, look: impl FnOnce(&Outbox) -> T) -> T {
+        look(&self.outbox())
+    }
+
     pub(super) fn outbox(&self) -> MutexGuard<'_, Outbox> {
         // The outbox is whole after every call, whoever panicked meanwhile.
         self.outbox.lock().unwrap_or_else(PoisonError::into_inner)
