@@ -20,7 +20,7 @@ test-page:
 
 # The discovery messages against a real Home Assistant core; downloads about 800 MB the first time.
 test-home-assistant:
-	@$(WITH_MOSQUITTO) exec tests/home-assistant/run
+	@$(WITH_MOSQUITTO) exec tests/home-assistant/run $(VERSION)
 
 lint:
 	cargo fmt --check

@@ -129,6 +129,11 @@ impl Wire {
         std::mem::take(&mut *self.log())
     }
 
+    /// The last of what has happened since the last [`Wire::take`].
+    pub fn last(&self) -> Option<Transaction> {
+        self.log().last().copied()
+    }
+
     /// How many of what has happened since the last [`Wire::take`] are as `wanted`.
     pub fn count(&self, wanted: impl Fn(&Transaction) -> bool) -> usize {
         self.log().iter().filter(|transaction| wanted(transaction)).count()

@@ -13,6 +13,11 @@ use crate::wire::Behaviour;
 const W1: Behaviour =
     Behaviour { line: W1_LINE, turnaround: W1_TURNAROUND, strict: false, counting: false, first_piece: None };
 
+/// Between two commands, so that each has had its outcome.
+const PAUSE: Duration = Duration::from_millis(200);
+/// Multiples of it fill the space between two whole numbers evenly.
+const GOLDEN: f64 = 0.618_033_988_749_895;
+
 pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
     let units: Vec<u8> = (1..=UNITS).collect();
     let points = points(true).0.replacen("poll: fast", "poll: fast, write: 0..65535", 1);
@@ -23,9 +28,15 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
     let began_at = now();
     let time = bench.seconds(60, 15).as_nanos() as i64;
     let mut sent: BTreeMap<u16, i64> = BTreeMap::new();
-    let mut random = Random(20_250_101);
+    let transaction = W1_LINE.read(REGISTERS, W1_TURNAROUND);
     while now() - began_at < time {
-        sleep(Duration::from_micros(random.between(200_000, 500_000)));
+        sleep(PAUSE);
+        // At moments that are spread evenly over a transaction: by chance, the median of some hundred commands
+        // would be more than a millisecond beside what it is.
+        let Some(last) = rig.wire.last().and_then(|seen| seen.ended_at) else { continue };
+        let phase = (sent.len() as f64 * GOLDEN).fract();
+        let moment = last + W1_LINE.silence() + transaction + (phase * transaction as f64) as i64;
+        sleep(Duration::from_nanos((moment - now()).max(0) as u64));
         let value = 2000 + sent.len() as u16;
         let unit = sent.len() % units.len() + 1;
         let at = rig.observer.publish(&format!("busker/unit_{unit}/p0/set"), &value.to_string())?;
@@ -132,14 +143,4 @@ pub fn w5(bench: &mut Bench) -> anyhow::Result<()> {
     ];
     bench.tell(noise, figures);
     Ok(())
-}
-
-/// Moments that keep no step with the polls, and are the same in each run.
-struct Random(u64);
-
-impl Random {
-    fn between(&mut self, least: u64, most: u64) -> u64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        least + (self.0 >> 33) % (most - least)
-    }
 }

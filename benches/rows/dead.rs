@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use anyhow::bail;
+
 use super::{AT_ONCE, Bench, Configured, Rig, UNITS, W1_LINE, W1_TURNAROUND, points};
 use crate::clock::{now, sleep};
 use crate::report::{Figure, Target, quantile};
@@ -24,7 +26,7 @@ pub fn w3(bench: &mut Bench) -> anyhow::Result<()> {
 
     let rig = Rig::start(behaviour, &Configured { units: &without, points: &points, period: AT_ONCE }, &[])?;
     let (transactions, noise) = rig.measure(bench.seconds(8, 4))?;
-    let alone = live_cycle(&transactions);
+    let alone = cycle(&transactions.iter().collect::<Vec<_>>());
     drop(rig);
 
     // Known: it has answered before it died, so that a probe of it may be short.
@@ -34,15 +36,15 @@ pub fn w3(bench: &mut Bench) -> anyhow::Result<()> {
     // Three requests in vain, and the pauses between probes have grown to their full length.
     sleep(bench.seconds(8, 6));
     let (transactions, noise_known) = rig.measure(bench.seconds(16, 8))?;
-    let known = live_cycle(&transactions);
+    let known = cycle(&whole_pauses(&transactions)?);
     let (back_known, known_by_mqtt) = revive(&mut rig, bench.runs())?;
     drop(rig);
 
-    // Never heard of: each probe waits for the whole response timeout.
+    // Never heard of: every other probe waits for the whole response timeout, and pauses are long.
     let mut rig = Rig::start(behaviour, &configured, &[DEAD])?;
-    sleep(bench.seconds(10, 8));
-    let (transactions, noise_unknown) = rig.measure(bench.seconds(20, 8))?;
-    let unknown = live_cycle(&transactions);
+    sleep(bench.seconds(12, 12));
+    let (transactions, noise_unknown) = rig.measure(bench.seconds(44, 33))?;
+    let unknown = cycle(&whole_pauses(&transactions)?);
     let (back_unknown, _) = revive(&mut rig, 1)?;
 
     let cost = |cycle: f64| (cycle / alone - 1.0) * 100.0;
@@ -62,10 +64,24 @@ pub fn w3(bench: &mut Bench) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// What is between two requests to the dead unit, and an even number of pauses: each costs what a probe
+/// takes, long or short, and a part of one would cost too much or nothing.
+fn whole_pauses(transactions: &[Transaction]) -> anyhow::Result<Vec<&Transaction>> {
+    let followed = transactions.iter().take(transactions.len().saturating_sub(1));
+    let is_probe = |(at, seen): (usize, &Transaction)| (seen.unit == DEAD).then_some(at);
+    let probes: Vec<usize> = followed.enumerate().filter_map(is_probe).collect();
+    let pauses = probes.len().saturating_sub(1) / 2 * 2;
+    let (Some(first), true) = (probes.first(), pauses > 0) else {
+        bail!("the dead unit was asked {} times only", probes.len());
+    };
+    // Both live requests at the ends are the first ones after a probe.
+    Ok(transactions[first + 1..].iter().take(probes[pauses] + 1 - first).collect())
+}
+
 /// The mean cycle of the units that answer, in nanoseconds, less what the wire itself was late. Rare long
 /// interruptions count as what they are, so it is no median.
-fn live_cycle(transactions: &[Transaction]) -> f64 {
-    let live: Vec<&Transaction> = transactions.iter().filter(|seen| seen.unit != DEAD).collect();
+fn cycle(transactions: &[&Transaction]) -> f64 {
+    let live: Vec<&&Transaction> = transactions.iter().filter(|seen| seen.unit != DEAD).collect();
     let (Some(first), Some(last)) = (live.first(), live.last()) else { return f64::INFINITY };
     let late: i64 = transactions.iter().map(|seen| seen.wire_late).sum();
     let rounds = (live.len() - 1) as f64 / f64::from(UNITS - 1);

@@ -158,6 +158,9 @@ fn open(
 ) -> Result<Asked, Failure> {
     let opened = Link::open(link).map_err(|lost| anyhow!("{lost}"))?;
     let broadcasts = !matches!(link, settings::Link::Tcp { .. });
+    if let Some(device) = &device {
+        std::thread::sleep(device.wire.connect_delay);
+    }
     let link = GuardedLink::new(opened, Guard::new(link, gap), Clock::start());
     Ok(Asked { link, unit, broadcasts, timeout, device })
 }

@@ -8,7 +8,7 @@ use anyhow::Context;
 use tokio::runtime::Runtime;
 use tokio::task::JoinHandle;
 
-use crate::edge::bus_thread::{self, BusHandle};
+use crate::edge::bus_thread::{BusHandle, Threads};
 use crate::edge::clock::Clock;
 use crate::edge::files;
 use crate::edge::http::Http;
@@ -26,9 +26,11 @@ use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 use crate::engine::topics::{Message, Topics};
 
-/// How often the gateway looks at itself. What has changed for the worse or the better is told at
-/// once, the rest each minute.
+/// How often the gateway looks whether anything has changed for the worse or the better, which is told at
+/// once. The rest is told each minute.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// How often it asks each bus although none has anything new: it may be stuck.
+const ASK_EVERY: Duration = Duration::from_secs(10);
 const TELL_HEALTH_EVERY: Duration = Duration::from_secs(60);
 
 /// How long the buses may take to finish what is in flight.
@@ -44,6 +46,7 @@ pub struct App {
     pub(super) http: Option<Http>,
     pub(super) reporter: Arc<Reporter>,
     pub(super) state: Arc<StateFiles>,
+    pub(super) threads: Threads,
     pub(super) watch: JoinHandle<()>,
 }
 
@@ -73,8 +76,9 @@ impl App {
     /// knows devices. An error means that nothing is left running.
     pub fn start(settings: Settings, library: Library, state: StateFiles) -> anyhow::Result<App> {
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
+        // One worker: a second one finds something to do so seldom that waking it costs more than it saves.
         let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(2)
+            .worker_threads(1)
             .thread_name("edge")
             .enable_all()
             .build()
@@ -90,7 +94,8 @@ impl App {
         recall(&plant, &state);
         introduce(&plant.settings(), &plant.topics(), &plant.mailbox());
         let everyone = 0..plant.settings().buses.len();
-        let buses = start_buses(&plant, everyone, clock, &state)?;
+        let threads = Threads::default();
+        let buses = start_buses(&threads, &plant, everyone, clock, &state)?;
         plant.set_buses(buses.clone());
 
         let _inside = runtime.enter();
@@ -101,7 +106,7 @@ impl App {
         let http =
             listener.map(|listener| Http::serve(listener, reporter.clone(), clock, keys.token.clone()));
         let watch = tokio::spawn(watch(reporter.clone(), plant.clone(), state.clone()));
-        Ok(App { runtime, clock, plant, broker: Some(broker), keys, http, reporter, state, watch })
+        Ok(App { runtime, clock, plant, broker: Some(broker), keys, http, reporter, state, threads, watch })
     }
 
     /// Where HTTP listens, if it does.
@@ -169,6 +174,7 @@ fn info(settings: &Settings, topics: &Topics) -> Message {
 
 /// Starts the buses of these numbers of the plant's settings. An error means that none of them runs.
 pub(super) fn start_buses(
+    threads: &Threads,
     plant: &Plant,
     which: impl IntoIterator<Item = usize>,
     clock: Clock,
@@ -177,7 +183,7 @@ pub(super) fn start_buses(
     let settings = plant.settings();
     let mut buses: Vec<Arc<BusHandle>> = Vec::new();
     for index in which {
-        match start_bus(&settings, index, clock, state, plant.mailbox()) {
+        match start_bus(threads, &settings, index, clock, state, plant.mailbox()) {
             Ok(handle) => buses.push(handle),
             Err(error) => {
                 buses.iter().for_each(|bus| bus.shutdown());
@@ -190,6 +196,7 @@ pub(super) fn start_buses(
 }
 
 pub(super) fn start_bus(
+    threads: &Threads,
     settings: &Arc<Settings>,
     index: usize,
     clock: Clock,
@@ -197,7 +204,7 @@ pub(super) fn start_bus(
     mailbox: Arc<Mailbox>,
 ) -> anyhow::Result<Arc<BusHandle>> {
     let publish = Box::new(move |message| mailbox.push(message));
-    let started = bus_thread::start(settings.clone(), index, clock, state.clone(), publish);
+    let started = threads.start(settings.clone(), index, clock, state.clone(), publish);
     let name = &settings.buses[index].name;
     started.map(Arc::new).with_context(|| format!("bus {name} cannot be started"))
 }
@@ -247,20 +254,34 @@ pub(super) fn watched(
 /// Looks at the gateway again and again: tells its health, and feeds systemd's watchdog while every
 /// bus answers.
 pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc<StateFiles>) {
-    let every = shutdown::watchdog_interval().map_or(LOOK_EVERY, |interval| interval.min(LOOK_EVERY));
+    let watchdog = shutdown::watchdog_interval().unwrap_or(ASK_EVERY);
+    let every = watchdog.min(LOOK_EVERY);
+    let rounds = |time: Duration| (time.as_millis() / every.as_millis().max(1)).max(1);
+    let (rounds_to_tell, rounds_to_ask) = (rounds(TELL_HEALTH_EVERY), rounds(watchdog.min(ASK_EVERY)));
     let mut ticks = tokio::time::interval(every);
-    let rounds = TELL_HEALTH_EVERY.as_millis() / every.as_millis().max(1);
     let mut told: Option<Vec<bool>> = None;
     let mut told_info = info(&plant.settings(), &plant.topics());
+    let mut seen = None;
+    let mut responding = true;
     for round in 0u128.. {
         ticks.tick().await;
+        // All are asked, so that none is asked for nothing the next time.
+        let stirred = plant.buses().iter().filter(|bus| bus.take_stirred()).count() > 0;
+        let broker = plant.broker();
+        let others = (broker.connected, broker.client_id_taken, reporter.configuration_error());
+        let is_new = seen.as_ref() != Some(&others) || stirred || !responding;
+        if !is_new && round % rounds_to_ask != 0 && round % rounds_to_tell != 0 {
+            continue;
+        }
+        seen = Some(others);
         let report = reporter.report(Detail::Devices).await;
-        if report.buses.iter().all(|bus| bus.responding) {
+        responding = report.buses.iter().all(|bus| bus.responding);
+        if responding {
             shutdown::feed_watchdog();
         }
         let (topics, mailbox) = (plant.topics(), plant.mailbox());
         let states = states(&report);
-        if round % rounds.max(1) == 0 || told.as_ref() != Some(&states) {
+        if round % rounds_to_tell == 0 || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
         }

@@ -1,32 +1,30 @@
-//! The loop around [`crate::engine::bus::Bus`]: one thread per bus performs what the engine
-//! decides.
+//! The threads that run buses. A serial line has one of its own, TCP connections share one.
 //!
-//! A thread and not a task: the silence between two frames is 2 ms, and a timer that is a
-//! millisecond late costs a tenth of a fast line.
+//! Threads and not tasks: the silence between two frames is 2 ms, and a timer that is a millisecond late
+//! costs a tenth of a fast line. A connection has no such silence; there it is a thread's waking up that
+//! costs most, and one that serves many finds several replies each time.
 
 use std::num::NonZeroU64;
+use std::os::fd::OwnedFd;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
 
+use rustix::buffer::spare_capacity;
+use rustix::event::epoll;
 use tokio::sync::oneshot;
 
 use crate::edge::bell::Bell;
+use crate::edge::bus_runner::{BusRunner, Ears, LOOKS_MAX, Look};
 use crate::edge::clock::Clock;
-use crate::edge::guarded_link::{GuardedLink, Woken, wait};
-use crate::edge::link::{Link, Lost};
+use crate::edge::guarded_link::{Woken, wait};
+use crate::edge::link::{Lost, timespec};
 use crate::edge::punctual::Punctual;
 use crate::edge::state_files::StateFiles;
-use crate::engine::bus::{Action, Bus, Command, Event, Full, Inbox, Severity};
-use crate::engine::modbus::Reply;
-use crate::engine::modbus::guard::Guard;
-use crate::engine::settings::Settings;
+use crate::engine::bus::{Bus, Command, Event, Full, Inbox};
+use crate::engine::settings::{Link, Settings};
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
-
-/// Looks that may wait for the thread.
-const LOOKS_MAX: usize = 64;
 
 /// Talks to a bus's thread. Dropping it does not stop the thread.
 pub struct BusHandle {
@@ -34,51 +32,8 @@ pub struct BusHandle {
     looks: SyncSender<Look>,
     bell: Bell,
     stop: Arc<AtomicBool>,
-    thread: Mutex<Option<JoinHandle<()>>>,
-}
-
-/// Something that looks at the bus on its thread.
-type Look = Box<dyn FnOnce(&Bus, Time) + Send>;
-
-/// Starts the thread of the bus number `index`. `publish` is called on that thread and must not
-/// wait.
-pub fn start(
-    settings: Arc<Settings>,
-    index: usize,
-    clock: Clock,
-    state: Arc<StateFiles>,
-    publish: Box<dyn Fn(Message) + Send>,
-) -> std::io::Result<BusHandle> {
-    let inbox = Arc::<Mutex<Inbox>>::default();
-    let thread_inbox = inbox.clone();
-    let (looks, looks_in) = sync_channel(LOOKS_MAX);
-    let bell = Bell::new()?;
-    let stop = Arc::new(AtomicBool::new(false));
-    let (thread_bell, thread_stop) = (bell.clone(), stop.clone());
-    let thread =
-        std::thread::Builder::new().name(format!("bus-{}", settings.buses[index].name)).spawn(move || {
-            let bus = Bus::new(clock.now(), &settings, index, &state.memories());
-            let port = Port::Closed;
-            let (bell, stop) = (thread_bell, thread_stop);
-            let (stopping, punctual) = (false, Punctual::default());
-            BusThread {
-                settings,
-                index,
-                clock,
-                state,
-                publish,
-                bus,
-                port,
-                inbox: thread_inbox,
-                looks: looks_in,
-                bell,
-                stop,
-                stopping,
-                punctual,
-            }
-            .run();
-        })?;
-    Ok(BusHandle { inbox, looks, bell, stop, thread: Mutex::new(Some(thread)) })
+    stirred: Arc<AtomicBool>,
+    ended: Mutex<Option<Receiver<()>>>,
 }
 
 impl BusHandle {
@@ -106,230 +61,265 @@ impl BusHandle {
         receiver
     }
 
+    /// Whether anything has happened since this was last asked, but that devices answered as they should.
+    pub fn take_stirred(&self) -> bool {
+        self.stirred.swap(false, Ordering::Relaxed)
+    }
+
     /// Asks the bus to finish the request in flight, refuse what waits, say `offline` and end.
     pub fn shutdown(&self) {
         self.stop.store(true, Ordering::SeqCst);
         self.bell.ring();
     }
 
-    /// Waits for the thread's end.
+    /// Waits for the bus's end.
     pub fn join(&self) {
-        let thread = self.thread.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).take();
-        if let Some(thread) = thread {
-            if thread.join().is_err() {
-                tracing::error!("a bus thread ended in a panic");
-            }
+        let ended = lock(&self.ended).take();
+        if ended.is_some_and(|ended| ended.recv().is_err()) {
+            tracing::error!("a bus ended in a panic");
         }
     }
 }
 
-fn lock(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
-    // It is whole after every call, whoever panicked meanwhile.
-    inbox.lock().unwrap_or_else(PoisonError::into_inner)
+/// The threads of a gateway's buses. After it is dropped each ends with its last bus.
+#[derive(Default)]
+pub struct Threads {
+    shared: Mutex<Option<Arc<Shared>>>,
 }
 
-/// The link, from closed to open and back.
-enum Port {
-    Closed,
-    /// To be opened then.
-    Waiting(Time),
-    /// Being opened by a thread of its own, because that may take seconds.
-    Opening(Receiver<Result<Link, Lost>>),
-    Open(Box<GuardedLink>),
-}
-
-struct BusThread {
-    settings: Arc<Settings>,
-    index: usize,
-    clock: Clock,
-    state: Arc<StateFiles>,
-    publish: Box<dyn Fn(Message) + Send>,
-    bus: Bus,
-    port: Port,
-    inbox: Arc<Mutex<Inbox>>,
-    looks: Receiver<Look>,
-    bell: Bell,
-    stop: Arc<AtomicBool>,
-    stopping: bool,
-    punctual: Punctual,
-}
-
-impl BusThread {
-    fn run(mut self) {
-        // By default the kernel may wake a thread 50 µs late to save power.
-        if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
-            tracing::debug!("the timer slack stays as it is: {error}");
+impl Threads {
+    /// Starts the bus number `index`. `publish` is called on its thread and must not wait.
+    pub fn start(
+        &self,
+        settings: Arc<Settings>,
+        index: usize,
+        clock: Clock,
+        state: Arc<StateFiles>,
+        publish: Box<dyn Fn(Message) + Send>,
+    ) -> std::io::Result<BusHandle> {
+        let inbox = Arc::<Mutex<Inbox>>::default();
+        let (looks, looks_in) = sync_channel(LOOKS_MAX);
+        let (ended, end) = sync_channel(1);
+        let stop = Arc::new(AtomicBool::new(false));
+        let stirred = Arc::new(AtomicBool::new(true));
+        let shares = matches!(settings.buses[index].link, Link::Tcp { .. });
+        let shared = if shares { Some(self.shared()?) } else { None };
+        let bell = match &shared {
+            Some(shared) => shared.bell.clone(),
+            None => Bell::new()?,
+        };
+        let ears = Ears {
+            inbox: inbox.clone(),
+            looks: looks_in,
+            bell: bell.clone(),
+            stop: stop.clone(),
+            stirred: stirred.clone(),
+            ended,
+        };
+        let name = format!("bus-{}", settings.buses[index].name);
+        let runner = move || BusRunner::new(settings, index, clock, state, publish, ears);
+        match shared {
+            Some(shared) => {
+                lock(&shared.arrivals).push(runner());
+                shared.bell.ring();
+            }
+            None => {
+                std::thread::Builder::new().name(name).spawn(move || run_alone(runner()))?;
+            }
         }
+        Ok(BusHandle { inbox, looks, bell, stop, stirred, ended: Mutex::new(Some(end)) })
+    }
+
+    /// The thread for connections, which begins with the first of them.
+    fn shared(&self) -> std::io::Result<Arc<Shared>> {
+        let mut shared = lock(&self.shared);
+        if let Some(shared) = &*shared {
+            return Ok(shared.clone());
+        }
+        let new = Arc::new(Shared {
+            bell: Bell::new()?,
+            arrivals: Mutex::default(),
+            closing: AtomicBool::new(false),
+        });
+        let epoll = epoll::create(epoll::CreateFlags::CLOEXEC)?;
+        epoll::add(&epoll, &new.bell, epoll::EventData::new_u64(BELL), epoll::EventFlags::IN)?;
+        let of_thread = new.clone();
+        let run =
+            move || SharedThread { shared: of_thread, epoll, runners: Vec::new(), next_number: 0 }.run();
+        std::thread::Builder::new().name("connections".into()).spawn(run)?;
+        *shared = Some(new.clone());
+        Ok(new)
+    }
+}
+
+impl Drop for Threads {
+    fn drop(&mut self) {
+        if let Some(shared) = &*lock(&self.shared) {
+            shared.closing.store(true, Ordering::SeqCst);
+            shared.bell.ring();
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// By default the kernel may wake a thread 50 µs late to save power.
+fn wake_punctually() {
+    if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
+        tracing::debug!("the timer slack stays as it is: {error}");
+    }
+}
+
+/// Runs a bus to its end.
+fn run_alone(mut runner: BusRunner) {
+    wake_punctually();
+    let mut punctual = Punctual::default();
+    runner.begin();
+    while !runner.is_finished() {
+        let woken = wait_alone(&mut runner, &mut punctual);
+        if woken.bell {
+            runner.bell().silence();
+        }
+        runner.woken(woken.bell, woken.link || !woken.bell);
+    }
+    runner.finish();
+}
+
+/// Waits for whatever comes first.
+fn wait_alone(runner: &mut BusRunner, punctual: &mut Punctual) -> Woken {
+    let clock = runner.clock();
+    let wake_at = runner.wake_at();
+    let has_nothing_to_do = runner.link().is_some_and(|link| link.wake_at().is_none());
+    let send_at = runner.link().and_then(|link| link.send_at());
+    let exactly = send_at.filter(|at| Some(*at) == wake_at);
+    let since = clock.now();
+    let until = exactly.map(|at| punctual.sleep_until(at)).or(wake_at);
+    let woken = match wait(runner.link(), Some(runner.bell()), until.map(|until| until - since)) {
+        Ok(woken) => woken,
+        Err(lost) => {
+            runner.lose(lost);
+            return Woken { bell: true, link: true };
+        }
+    };
+    if has_nothing_to_do {
+        punctual.rested(clock.now());
+    }
+    match (woken, until) {
+        (Woken { link: true, .. }, _) => {
+            let came_at = punctual.woken_by(since, clock.now());
+            if let Some(link) = runner.link_mut() {
+                link.woken_by(came_at);
+            }
+        }
+        (Woken { bell: false, .. }, Some(until)) => {
+            punctual.slept(since, until, clock.now());
+            while exactly.is_some_and(|at| clock.now() < at) {
+                std::hint::spin_loop();
+            }
+        }
+        _ => {}
+    }
+    woken
+}
+
+/// What others know of the thread for connections.
+struct Shared {
+    bell: Bell,
+    arrivals: Mutex<Vec<BusRunner>>,
+    /// No more buses come.
+    closing: AtomicBool,
+}
+
+/// Stands for the bell where links have numbers.
+const BELL: u64 = u64::MAX;
+/// Links that are heard at one look.
+const HEARD_MAX: usize = 64;
+
+struct SharedThread {
+    shared: Arc<Shared>,
+    epoll: OwnedFd,
+    runners: Vec<Numbered>,
+    next_number: u64,
+}
+
+struct Numbered {
+    number: u64,
+    runner: BusRunner,
+    wake_at: Option<Time>,
+}
+
+impl SharedThread {
+    fn run(mut self) {
+        wake_punctually();
+        let mut heard = Vec::with_capacity(HEARD_MAX);
         loop {
-            self.perform();
-            if self.bus.is_finished() {
+            self.wait(&mut heard);
+            let rung = heard.iter().any(|event| event.data.u64() == BELL);
+            if rung {
+                self.shared.bell.silence();
+                self.welcome();
+            }
+            for numbered in &mut self.runners {
+                let is_heard = heard.iter().any(|event| event.data.u64() == numbered.number);
+                let runner = &mut numbered.runner;
+                let is_due = numbered.wake_at.is_some_and(|at| runner.clock().now() >= at);
+                if rung || is_heard || is_due {
+                    runner.woken(rung, is_heard || is_due);
+                    numbered.settle(&self.epoll);
+                }
+            }
+            heard.clear();
+            self.let_go();
+            if self.runners.is_empty() && self.shared.closing.load(Ordering::SeqCst) {
                 return;
             }
-            if self.wait() {
-                self.bell.silence();
-                self.read_letters();
-                self.stop_if_asked();
-            }
-            self.advance_port();
-            if self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
-                self.handle(Event::Wake);
-            }
         }
     }
 
-    fn handle(&mut self, event: Event) {
-        let now = self.clock.now();
-        self.bus.set_date(now, self.clock.today());
-        self.bus.handle(now, event);
-        self.perform();
+    /// Waits for whatever comes first.
+    fn wait(&self, heard: &mut Vec<epoll::Event>) {
+        let next =
+            self.runners.iter().filter_map(|numbered| Some((numbered.wake_at?, numbered.runner.clock())));
+        let next = next.min_by_key(|(at, _)| *at);
+        let timeout = next.map(|(at, clock)| timespec(clock.until(at)));
+        // An interruption is as good as a time that has come; nothing else can fail here.
+        let _ = epoll::wait(&self.epoll, spare_capacity(heard), timeout.as_ref());
     }
 
-    fn perform(&mut self) {
-        while let Some(action) = self.bus.next_action() {
-            match action {
-                Action::Send { request, not_before, timeout } => {
-                    let begun = match &mut self.port {
-                        Port::Open(link) => link.begin(&request, not_before, timeout),
-                        _ => Err(Lost("the link is not open".into())),
-                    };
-                    self.line_said(begun);
-                }
-                Action::Withdraw => {
-                    if let Port::Open(link) = &mut self.port {
-                        if link.take_back() {
-                            self.bus.handle(self.clock.now(), Event::Withdrawn);
-                        }
-                    }
-                }
-                Action::Publish(message) => (self.publish)(message),
-                Action::Store(record) => self.state.store(record),
-                Action::Reopen { after } => self.port = Port::Waiting(self.clock.now() + after),
-                Action::Say(Severity::Info, text) => tracing::info!("{text}"),
-                Action::Say(Severity::Warning, text) => tracing::warn!("{text}"),
-            }
+    /// Takes the buses that have come.
+    fn welcome(&mut self) {
+        for mut runner in lock(&self.shared.arrivals).drain(..) {
+            runner.begin();
+            let mut numbered = Numbered { number: self.next_number, runner, wake_at: None };
+            numbered.settle(&self.epoll);
+            self.runners.push(numbered);
+            self.next_number += 1;
         }
     }
 
-    /// Waits for whatever comes first; whether the bell has rung, and there may be letters.
-    fn wait(&mut self) -> bool {
-        let (link, port_wakes_at, send_at) = match &self.port {
-            Port::Closed | Port::Opening(_) => (None, None, None),
-            Port::Waiting(open_at) => (None, Some(*open_at), None),
-            Port::Open(link) => (Some(&**link), link.wake_at(), link.send_at()),
-        };
-        let wake_at = port_wakes_at.into_iter().chain(self.bus.wake_at()).min();
-        let exactly = send_at.filter(|at| Some(*at) == wake_at);
-        let until = exactly.map(|at| self.punctual.sleep_until(at)).or(wake_at);
-        let since = self.clock.now();
-        let woken = match wait(link, Some(&self.bell), until.map(|until| until - since)) {
-            Ok(woken) => woken,
-            Err(lost) => {
-                self.lose(lost);
-                return true;
-            }
-        };
-        match (woken, until) {
-            (Woken { link: true, .. }, _) => {
-                if let Port::Open(link) = &mut self.port {
-                    link.woken_by(self.punctual.woken_by(since, self.clock.now()));
-                }
-            }
-            (Woken { bell: false, .. }, Some(until)) => {
-                self.punctual.slept(since, until, self.clock.now());
-                while exactly.is_some_and(|at| self.clock.now() < at) {
-                    std::hint::spin_loop();
-                }
-            }
-            _ => {}
+    fn let_go(&mut self) {
+        while let Some(at) = self.runners.iter().position(|numbered| numbered.runner.is_finished()) {
+            self.runners.remove(at).runner.finish();
         }
-        woken.bell
-    }
-
-    fn read_letters(&mut self) {
-        // At most as many as can wait, so that a flood does not keep the line waiting.
-        for _ in 0..Inbox::LIMIT {
-            let event = lock(&self.inbox).take();
-            let Some(event) = event else { break };
-            self.handle(event);
-        }
-        if !lock(&self.inbox).is_empty() {
-            self.bell.ring();
-        }
-        while let Ok(look) = self.looks.try_recv() {
-            look(&self.bus, self.clock.now());
-        }
-    }
-
-    fn stop_if_asked(&mut self) {
-        if self.stopping || !self.stop.load(Ordering::SeqCst) {
-            return;
-        }
-        self.stopping = true;
-        self.handle(Event::Shutdown);
-        if let Port::Open(link) = &mut self.port {
-            if let Some(reply) = link.withdraw("busker stops") {
-                self.handle(Event::Reply(reply));
-            }
-        }
-    }
-
-    fn advance_port(&mut self) {
-        match &mut self.port {
-            Port::Closed => {}
-            Port::Waiting(open_at) if self.clock.now() < *open_at => {}
-            Port::Waiting(_) => self.port = self.open(),
-            Port::Opening(opened) => match opened.try_recv() {
-                Ok(Ok(link)) => {
-                    let bus = &self.settings.buses[self.index];
-                    let guard = Guard::new(&bus.link, bus.gap);
-                    self.port = Port::Open(Box::new(GuardedLink::new(link, guard, self.clock)));
-                    self.handle(Event::LinkUp);
-                }
-                Ok(Err(lost)) => self.lose(lost),
-                Err(TryRecvError::Empty) => {}
-                Err(TryRecvError::Disconnected) => self.lose(Lost("it could not be opened".into())),
-            },
-            Port::Open(link) => {
-                let said = link.advance();
-                self.line_said(said);
-            }
-        }
-    }
-
-    fn open(&self) -> Port {
-        let (sender, receiver) = sync_channel(1);
-        let (settings, index, bell) = (self.settings.clone(), self.index, self.bell.clone());
-        let opener = std::thread::Builder::new().name("open".into()).spawn(move || {
-            // When the bus stops meanwhile, the link is closed again with the channel.
-            let _ = sender.send(Link::open(&settings.buses[index].link));
-            bell.ring();
-        });
-        if let Err(error) = opener {
-            tracing::error!("no thread can be started: {error}");
-        }
-        Port::Opening(receiver)
-    }
-
-    fn line_said(&mut self, said: Result<Option<Reply>, Lost>) {
-        match said {
-            Ok(Some(reply)) => self.handle(Event::Reply(reply)),
-            Ok(None) => {}
-            Err(lost) => self.lose(lost),
-        }
-    }
-
-    /// Closes the descriptor at once: as long as it is held, an adapter that comes back gets
-    /// another name.
-    fn lose(&mut self, Lost(reason): Lost) {
-        self.port = Port::Closed;
-        self.handle(Event::LinkDown(reason));
     }
 }
 
-impl Drop for BusThread {
-    /// Also when it ends in a panic: what is sent to it now is refused, and not left to wait for ever.
-    fn drop(&mut self) {
-        lock(&self.inbox).close();
+impl Numbered {
+    /// After the bus has done something: sees to it that it is woken for what comes next.
+    fn settle(&mut self, epoll: &OwnedFd) {
+        if self.runner.take_newly_open() {
+            // A link that is closed leaves by itself.
+            let heard = self.runner.link().map(|link| {
+                epoll::add(epoll, link, epoll::EventData::new_u64(self.number), epoll::EventFlags::IN)
+            });
+            if let Some(Err(error)) = heard {
+                self.runner.lose(Lost(error.to_string()));
+                self.runner.begin();
+            }
+        }
+        self.wake_at = self.runner.wake_at();
     }
 }
 

@@ -41,7 +41,9 @@ fn run(settings: Arc<Settings>) -> (BusHandle, Receiver<Message>) {
     let (sender, messages) = channel();
     // The test may have heard enough.
     let publish = move |message| drop(sender.send(message));
-    let bus = start(settings, 0, Clock::start(), nowhere(), Box::new(publish)).expect("a thread");
+    let bus = Threads::default()
+        .start(settings, 0, Clock::start(), nowhere(), Box::new(publish))
+        .expect("a thread");
     (bus, messages)
 }
 
@@ -127,7 +129,8 @@ fn what_does_not_fit_into_the_inbox_is_refused_and_not_waited_for() {
     let publish = move |_| {
         let _ = hold.lock().expect("one thread").recv();
     };
-    let bus = start(settings("/dev/no-such", "1s"), 0, Clock::start(), nowhere(), Box::new(publish))
+    let bus = Threads::default()
+        .start(settings("/dev/no-such", "1s"), 0, Clock::start(), nowhere(), Box::new(publish))
         .expect("a thread");
     let taken = (0..=Inbox::LIMIT).filter(|_| bus.send(Event::BrokerUp).is_ok()).count();
     assert_eq!(taken, Inbox::LIMIT);

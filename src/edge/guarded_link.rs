@@ -1,5 +1,7 @@
 //! A link and its guard: moves bytes between the two, stamps them, and keeps the guard's times.
 
+use std::os::fd::{AsFd, BorrowedFd};
+
 use rustix::event::{PollFd, PollFlags, poll};
 
 use crate::edge::bell::Bell;
@@ -116,6 +118,12 @@ impl GuardedLink {
     }
 }
 
+impl AsFd for GuardedLink {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.link.as_fd()
+    }
+}
+
 /// A reply that names the link as the fault is no reply but the link's end.
 fn usable(reply: Option<Reply>) -> Result<Option<Reply>, Lost> {
     match reply {
@@ -139,7 +147,7 @@ pub fn wait(
 ) -> Result<Woken, Lost> {
     let mut descriptors: Vec<PollFd<'_>> = Vec::with_capacity(2);
     descriptors.extend(bell.map(|bell| PollFd::new(bell, PollFlags::IN)));
-    descriptors.extend(link.map(|link| PollFd::new(&link.link, PollFlags::IN)));
+    descriptors.extend(link.map(|link| PollFd::new(link, PollFlags::IN)));
     match poll(&mut descriptors, timeout.map(timespec).as_ref()) {
         Ok(_) => {
             let mut called = descriptors.iter().map(|descriptor| !descriptor.revents().is_empty());

@@ -2,6 +2,7 @@
 
 pub mod app;
 pub mod bell;
+pub mod bus_runner;
 pub mod bus_thread;
 pub mod clock;
 pub mod files;

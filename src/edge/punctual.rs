@@ -17,6 +17,10 @@ const LEAST_MAX: u64 = 60;
 /// A shorter sleep says nothing: the core has hardly begun to sleep.
 const SLEEP_MIN: Duration = Duration::from_micros(200);
 
+/// A bus that rested so lately has time to spare, and none is spun for it: that would cost more than all
+/// else it does.
+const RESTED_LATELY: Duration = Duration::from_secs(1);
+
 /// The lags of one thread's latest wake-ups, in microseconds.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Punctual {
@@ -24,6 +28,8 @@ pub struct Punctual {
     seen: usize,
     /// Of all wake-ups so far.
     least: Option<u64>,
+    /// When the bus last had nothing to do.
+    rested_at: Option<Time>,
 }
 
 impl Punctual {
@@ -37,8 +43,17 @@ impl Punctual {
         }
     }
 
-    /// When to end a sleep so as to be awake at `at`.
+    /// The bus had nothing to do until `now`.
+    pub fn rested(&mut self, now: Time) {
+        self.rested_at = Some(now);
+    }
+
+    /// When to end a sleep so as to be awake at `at`; the rest is to be spun. `at` itself where nobody
+    /// would gain by it.
     pub fn sleep_until(&self, at: Time) -> Time {
+        if self.rested_at.is_some_and(|rested_at| at.since(rested_at) < RESTED_LATELY) {
+            return at;
+        }
         let mut lags = self.lags;
         let known = &mut lags[..self.seen.min(REMEMBERED)];
         known.sort_unstable();
@@ -82,6 +97,14 @@ mod tests {
         (0..REMEMBERED).for_each(|_| punctual.slept(Time(0), Time(1000), Time(1040)));
         assert_eq!(punctual.sleep_until(Time(5000)), Time(4940));
         punctual.slept(Time(0), Time(100), Time(101));
+    }
+
+    #[test]
+    fn nothing_is_spun_for_a_bus_that_has_time_to_spare() {
+        let mut punctual = after(&[50; 10]);
+        punctual.rested(Time(1_000_000));
+        assert_eq!(punctual.sleep_until(Time(1_900_000)), Time(1_900_000));
+        assert_eq!(punctual.sleep_until(Time(2_000_000)), Time(1_999_930));
     }
 
     #[test]

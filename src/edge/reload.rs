@@ -104,7 +104,7 @@ impl App {
         let everyone = 0..settings.buses.len();
         self.plant.begin_anew(settings, library);
         introduce(&self.plant.settings(), &self.plant.topics(), &self.plant.mailbox());
-        let buses = start_buses(&self.plant, everyone, self.clock, &self.state)?;
+        let buses = start_buses(&self.threads, &self.plant, everyone, self.clock, &self.state)?;
         self.plant.set_buses(buses.clone());
         self.keys = keys;
         let _inside = self.runtime.enter();
@@ -159,7 +159,14 @@ impl App {
                         let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
                         mailbox.push(homeassistant::announce_bus(&gateway, name).message());
                     }
-                    let bus = start_bus(&settings_of_threads, index, self.clock, &self.state, mailbox);
+                    let bus = start_bus(
+                        &self.threads,
+                        &settings_of_threads,
+                        index,
+                        self.clock,
+                        &self.state,
+                        mailbox,
+                    );
                     let bus =
                         bus.map_err(|error| error.context("the new configuration works only in part"))?;
                     if !is_connected {

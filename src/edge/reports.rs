@@ -69,6 +69,10 @@ impl Reporter {
         *lock(&self.configuration_error) = error;
     }
 
+    pub fn configuration_error(&self) -> Option<String> {
+        lock(&self.configuration_error).clone()
+    }
+
     /// The gateway as it is now; takes a second if a bus is stuck, and no longer if several are.
     pub async fn report(&self, detail: Detail) -> GatewayReport {
         let deadline = Instant::now() + ANSWER_WITHIN;

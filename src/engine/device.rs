@@ -51,6 +51,8 @@ pub struct Wire {
     pub intervals: Intervals,
     /// At least this long is waited for a reply; the bus may say more.
     pub response_timeout: Option<Duration>,
+    /// So long after the link has come up nothing is asked on it.
+    pub connect_delay: Duration,
     pub quirks: Quirks,
     /// The point that holds the time after which the device falls back to safe outputs unless a
     /// message reaches it.

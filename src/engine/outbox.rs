@@ -1,33 +1,27 @@
 //! What waits for the broker: the last value of each retained topic, and a bounded queue of the
-//! messages that are told once. The client library forgets what it has not sent when the connection
-//! breaks; this does not.
+//! messages that are told once; announcements first. The client library forgets what it has not sent when
+//! the connection breaks; this does not.
 
+mod farewells;
 mod manner;
+mod pace;
+mod queue;
 mod reconfigure;
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
-use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::homeassistant::Announcement;
 use crate::engine::settings::Manner;
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::{self, Kind, Message, OFFLINE, ONLINE, Topics};
 
-/// Messages told once that may wait; more push out the oldest. A slider that is dragged has a thousand outcomes
-/// in a moment, and each of them is told.
-const ONCE_MAX: usize = 2000;
-
-/// The empty queue keeps room for so many.
-const QUEUE_KEPT: usize = 1024;
+use pace::Pace;
+use queue::{Lane, Queue, Queued};
 
 /// Home Assistant subscribes to the states of a new entity only some time after it was announced,
 /// and takes no notice of what comes before (0.4 s were too short, 0.8 s long enough).
 const STATES_AFTER_DISCOVERY: Duration = Duration::from_millis(1500);
-
-/// So many messages are told in so long, at the most: a mosquitto queues a thousand for each reader and
-/// drops what is beyond, and a Home Assistant takes some hundred a second. When a gateway with many
-/// points came back, what was dropped could be that it is online.
-const AT_ONCE: usize = 100;
-const PERIOD: Duration = Duration::from_millis(200);
 
 /// The messages of one gateway on their way to its broker.
 #[derive(Clone, Debug)]
@@ -44,16 +38,13 @@ pub struct Outbox {
     /// What was taken away since Home Assistant last said that it listens. If it was not there to
     /// hear, it is told again when it starts.
     departed: BTreeMap<String, Announcement>,
-    retained: BTreeMap<String, Retained>,
-    queue: VecDeque<Queued>,
-    once_waiting: usize,
+    retained: BTreeMap<Arc<str>, Retained>,
+    queue: Queue,
+    pace: Pace,
     dropped: u64,
     /// Counts the retained topics, to send them again in the order in which they first came.
     next_number: u64,
     states_due_at: Option<Time>,
-    /// When the present period began, and how many messages were told in it.
-    period_began: Time,
-    told: usize,
 }
 
 #[derive(Clone, Debug)]
@@ -63,15 +54,6 @@ struct Retained {
     number: u64,
     /// The broker may keep a value of an earlier run, which nobody would replace.
     kept: bool,
-}
-
-#[derive(Clone, Debug, PartialEq)]
-enum Queued {
-    /// Whatever the topic's newest payload is when its turn comes.
-    Newest(String),
-    Once(Message),
-    /// The topic shall be forgotten by the broker.
-    Removal(String),
 }
 
 impl Outbox {
@@ -91,13 +73,11 @@ impl Outbox {
             remembered: BTreeMap::new(),
             departed: BTreeMap::new(),
             retained: BTreeMap::new(),
-            queue: VecDeque::new(),
-            once_waiting: 0,
+            queue: Queue::default(),
+            pace: Pace::default(),
             dropped: 0,
             next_number: 0,
             states_due_at: None,
-            period_began: Time(0),
-            told: 0,
         }
     }
 
@@ -113,14 +93,11 @@ impl Outbox {
     /// The next message to send, if one waits and not too many have been told in a short time
     /// ([`Outbox::wake_at`]).
     pub fn next_message(&mut self, now: Time) -> Option<Message> {
-        if now >= self.period_began + PERIOD {
-            (self.period_began, self.told) = (now, 0);
-        }
-        if self.told == AT_ONCE {
+        if !self.pace.allows(now) {
             return None;
         }
         let message = self.take_first()?;
-        self.told += 1;
+        self.pace.told();
         Some(message)
     }
 
@@ -131,25 +108,17 @@ impl Outbox {
 
     fn take_first(&mut self) -> Option<Message> {
         loop {
-            let Some(next) = self.queue.pop_front() else {
-                // After a start or a reconnect everything was in it at once.
-                self.queue.shrink_to(QUEUE_KEPT);
-                return None;
-            };
-            match next {
-                Queued::Once(message) => {
-                    self.once_waiting -= 1;
-                    return Some(message);
-                }
+            match self.queue.pop_front()? {
+                Queued::Once(message) => return Some(*message),
                 Queued::Removal(topic) => return Some(Message::retained(topic, "")),
                 Queued::Newest(topic) => {
                     if let Some(entry) = self.retained.get_mut(&topic) {
                         if std::mem::take(&mut entry.kept) {
-                            self.queue.push_front(Queued::Newest(topic.clone()));
-                            return Some(Message::retained(topic, ""));
+                            self.queue.push_front(Lane::Others, Queued::Newest(topic.clone()));
+                            return Some(Message::retained(&*topic, ""));
                         }
                         entry.queued = false;
-                        return Some(Message::retained(topic, entry.payload.clone()));
+                        return Some(Message::retained(&*topic, entry.payload.clone()));
                     }
                 }
             }
@@ -158,19 +127,18 @@ impl Outbox {
 
     /// A message from [`Outbox::next_message`] could not be handed over: it is next again.
     pub fn put_back(&mut self, message: Message) {
-        self.told = self.told.saturating_sub(1);
+        self.pace.take_back();
+        let lane = self.lane(&message.topic);
         if !message.retain {
-            self.once_waiting += 1;
-            self.queue.push_front(Queued::Once(message));
-        } else if let Some(entry) = self.retained.get_mut(&message.topic) {
+            self.queue.push_front(lane, Queued::Once(Box::new(message)));
+        } else if let Some(entry) = self.retained.get_mut(&*message.topic) {
             entry.kept |= message.payload.is_empty();
             // A newer value that came meanwhile stands in the queue already.
-            if !entry.queued {
-                entry.queued = true;
-                self.queue.push_front(Queued::Newest(message.topic));
+            if !std::mem::replace(&mut entry.queued, true) {
+                self.queue.push_front(lane, Queued::Newest(message.topic.into()));
             }
         } else {
-            self.queue.push_front(Queued::Removal(message.topic));
+            self.queue.push_front(lane, Queued::Removal(message.topic));
         }
     }
 
@@ -179,57 +147,14 @@ impl Outbox {
     pub fn give_back(&mut self, messages: Vec<Message>) {
         // A value that is not retained waits already.
         let is_value = |message: &Message| {
-            self.topics.kind(&message.topic) == Kind::Value && self.retained.contains_key(&message.topic)
+            self.topics.kind(&message.topic) == Kind::Value && self.retained.contains_key(&*message.topic)
         };
         let messages: Vec<Message> = messages.into_iter().filter(|message| !is_value(message)).collect();
         for message in messages.into_iter().rev() {
-            if self.once_waiting < ONCE_MAX {
-                self.put_back(message);
-            } else {
+            if self.queue.is_full() {
                 self.dropped += 1;
-            }
-        }
-    }
-
-    /// The broker remembers this announcement, perhaps of an earlier run. What it holds and we do not
-    /// have any more is taken away properly; announcements that are not ours are left alone.
-    pub fn found(&mut self, topic: &str, payload: &str) {
-        let Some(found) = Announcement::parse(&self.topics, topic, payload) else { return };
-        if self.retained.contains_key(topic) {
-            self.take_leave(found);
-        } else if self.own_devices.contains(topic) {
-            self.remembered.insert(topic.to_string(), found);
-        } else {
-            self.queue.push_back(Queued::Removal(topic.to_string()));
-            self.departed.insert(topic.to_string(), found);
-        }
-    }
-
-    /// Buries what `found` has and the present announcement on its topic has not.
-    fn take_leave(&mut self, found: Announcement) {
-        let Some(entry) = self.retained.get(found.topic()) else { return };
-        let topic = found.topic();
-        let Some(present) = Announcement::parse(&self.topics, topic, &entry.payload) else { return };
-        if let Some(farewell) = homeassistant::farewell(&found, &present) {
-            let message = Message::retained(topic, entry.payload.clone());
-            // Home Assistant may have started since then, and buries only what it knows.
-            self.push_once(Message { retain: false, ..found.message() });
-            self.push_once(farewell);
-            self.push_retained(message);
-            self.departed.insert(found.topic().to_string(), found);
-        }
-    }
-
-    /// Takes away once more what was taken away while Home Assistant may not have listened: it keeps
-    /// entities over its own restart, and lets go only of what it has been told since.
-    fn take_leave_again(&mut self) {
-        for (topic, found) in std::mem::take(&mut self.departed) {
-            if self.retained.contains_key(&topic) {
-                self.take_leave(found);
-                self.departed.remove(&topic);
             } else {
-                self.push_once(Message { retain: false, ..found.message() });
-                self.queue.push_back(Queued::Removal(topic));
+                self.put_back(message);
             }
         }
     }
@@ -238,27 +163,24 @@ impl Outbox {
     /// anew, the gateway's own `online` after them, and then what was waiting to be told once.
     pub fn connected(&mut self) {
         self.push_retained(Message::retained(self.topics.bridge_state(), ONLINE));
-        let waiting = std::mem::take(&mut self.queue);
         let mut once: Vec<Message> = Vec::new();
-        let mut removals: Vec<Queued> = Vec::new();
-        for queued in waiting {
+        let mut removals: Vec<String> = Vec::new();
+        for queued in self.queue.take_all() {
             match queued {
-                Queued::Once(message) => once.push(message),
-                Queued::Removal(topic) if !self.retained.contains_key(&topic) => {
-                    removals.push(Queued::Removal(topic));
-                }
+                Queued::Once(message) => once.push(*message),
+                Queued::Removal(topic) if !self.retained.contains_key(&*topic) => removals.push(topic),
                 Queued::Newest(_) | Queued::Removal(_) => {}
             }
         }
         for topic in self.in_order(|_| true) {
             // A farewell goes before the announcement that it prepares.
-            let (before, rest) = once.into_iter().partition(|message| message.topic == topic);
+            let (before, rest) = once.into_iter().partition(|message| *message.topic == *topic);
             once = rest;
-            self.queue.extend(Vec::into_iter(before).map(Queued::Once));
-            self.queue.push_back(Queued::Newest(topic));
+            Vec::into_iter(before).for_each(|message| self.queue_last(Queued::Once(Box::new(message))));
+            self.queue_last(Queued::Newest(topic));
         }
-        self.queue.extend(once.into_iter().map(Queued::Once));
-        self.queue.extend(removals);
+        once.into_iter().for_each(|message| self.queue_last(Queued::Once(Box::new(message))));
+        removals.into_iter().for_each(|topic| self.queue_last(Queued::Removal(topic)));
         self.retained.values_mut().for_each(|entry| entry.queued = true);
         self.states_due_at = None;
     }
@@ -273,8 +195,8 @@ impl Outbox {
 
     /// When [`Outbox::wake`] or [`Outbox::next_message`] has something to do.
     pub fn wake_at(&self) -> Option<Time> {
-        let held_back = (self.told == AT_ONCE && !self.is_empty()).then(|| self.period_began + PERIOD);
-        self.states_due_at.into_iter().chain(held_back).min()
+        let held_until = self.pace.held_until().filter(|_| !self.is_empty());
+        self.states_due_at.into_iter().chain(held_until).min()
     }
 
     /// The time of [`Outbox::wake_at`] has come.
@@ -288,8 +210,8 @@ impl Outbox {
     /// The program ends: `offline` goes out behind everything that waits.
     pub fn goodbye(&mut self) {
         let topic = self.topics.bridge_state();
-        self.queue.retain(|queued| !matches!(queued, Queued::Newest(waiting) if *waiting == topic));
-        if let Some(entry) = self.retained.get_mut(&topic) {
+        self.queue.take_newest(self.lane(&topic), &topic);
+        if let Some(entry) = self.retained.get_mut(&*topic) {
             entry.queued = false;
         }
         self.push_retained(Message::retained(topic, OFFLINE));
@@ -306,16 +228,18 @@ impl Outbox {
     }
 
     fn push_retained(&mut self, message: Message) {
-        let number = self.next_number;
-        let kept = !self.values.retain && self.topics.kind(&message.topic) == Kind::Value;
-        let entry = self.retained.entry(message.topic.clone()).or_insert_with(|| {
+        if let Some(entry) = self.retained.get_mut(&*message.topic) {
+            entry.payload = message.payload;
+            if !std::mem::replace(&mut entry.queued, true) {
+                self.queue_last(Queued::Newest(message.topic.as_str().into()));
+            }
+        } else {
+            let topic: Arc<str> = message.topic.as_str().into();
+            let kept = !self.values.retain && self.topics.kind(&topic) == Kind::Value;
+            let entry = Retained { payload: message.payload, queued: true, number: self.next_number, kept };
             self.next_number += 1;
-            Retained { payload: String::new(), queued: false, number, kept }
-        });
-        entry.payload = message.payload;
-        if !entry.queued {
-            entry.queued = true;
-            self.queue.push_back(Queued::Newest(message.topic.clone()));
+            self.retained.insert(topic.clone(), entry);
+            self.queue_last(Queued::Newest(topic));
         }
         if let Some(found) = self.remembered.remove(&message.topic) {
             self.take_leave(found);
@@ -323,35 +247,43 @@ impl Outbox {
     }
 
     fn push_once(&mut self, message: Message) {
-        if self.once_waiting == ONCE_MAX {
-            let oldest = self.queue.iter().position(|queued| matches!(queued, Queued::Once(_)));
-            oldest.and_then(|at| self.queue.remove(at));
+        if self.queue.is_full() {
+            self.queue.drop_oldest_once();
             self.dropped += 1;
-        } else {
-            self.once_waiting += 1;
         }
-        let same_topic = Queued::Newest(message.topic.clone());
-        let waiting = self.queue.iter().position(|queued| *queued == same_topic);
-        self.queue.push_back(Queued::Once(message));
+        let lane = self.lane(&message.topic);
         // What is told once to a retained topic prepares the value that follows.
-        if let Some(value) = waiting.and_then(|at| self.queue.remove(at)) {
-            self.queue.push_back(value);
+        let value = self.queue.take_newest(lane, &message.topic);
+        self.queue.push_back(lane, Queued::Once(Box::new(message)));
+        if let Some(value) = value {
+            self.queue.push_back(lane, value);
+        }
+    }
+
+    fn queue_last(&mut self, queued: Queued) {
+        self.queue.push_back(self.lane(queued.topic()), queued);
+    }
+
+    fn lane(&self, topic: &str) -> Lane {
+        match self.rank(topic) {
+            Rank::Bridge | Rank::Discovery => Lane::Announcements,
+            _ => Lane::Others,
         }
     }
 
     /// Puts every retained topic of these ranks into the queue that is not there yet.
     fn queue_again(&mut self, wanted: impl Fn(Rank) -> bool) {
         for topic in self.in_order(wanted) {
-            if let Some(entry) = self.retained.get_mut(&topic).filter(|entry| !entry.queued) {
-                entry.queued = true;
-                self.queue.push_back(Queued::Newest(topic));
+            let Some(entry) = self.retained.get_mut(&topic) else { continue };
+            if !std::mem::replace(&mut entry.queued, true) {
+                self.queue_last(Queued::Newest(topic));
             }
         }
     }
 
     /// The retained topics of these ranks, by rank, then as they first came.
-    fn in_order(&self, wanted: impl Fn(Rank) -> bool) -> Vec<String> {
-        let mut topics: Vec<(Rank, u64, &String)> = self
+    fn in_order(&self, wanted: impl Fn(Rank) -> bool) -> Vec<Arc<str>> {
+        let mut topics: Vec<(Rank, u64, &Arc<str>)> = self
             .retained
             .iter()
             .map(|(topic, entry)| (self.rank(topic), entry.number, topic))
@@ -389,14 +321,16 @@ enum Rank {
 
 #[cfg(test)]
 mod tests {
+    use super::pace::{AT_ONCE, PERIOD};
+    use super::queue::ONCE_MAX;
     use super::*;
 
-    fn outbox() -> Outbox {
+    pub(super) fn outbox() -> Outbox {
         let identities = ["busker_bridge", "busker_boiler"].map(String::from);
         Outbox::new(Topics::new("busker"), "homeassistant", identities)
     }
 
-    fn retained(outbox: &mut Outbox, topic: &str, payload: &str) {
+    pub(super) fn retained(outbox: &mut Outbox, topic: &str, payload: &str) {
         outbox.push(Message::retained(topic, payload));
     }
 
@@ -405,9 +339,9 @@ mod tests {
     }
 
     /// Long after whatever was told before.
-    const LATER: Time = Time::from_millis(1_000_000_000);
+    pub(super) const LATER: Time = Time::from_millis(1_000_000_000);
 
-    fn take_all(outbox: &mut Outbox) -> Vec<Message> {
+    pub(super) fn take_all(outbox: &mut Outbox) -> Vec<Message> {
         let mut now = LATER;
         let mut all = Vec::new();
         while !outbox.is_empty() {
@@ -419,7 +353,7 @@ mod tests {
 
     /// Takes all and compares: `topic payload`, with a `!` behind what is not retained.
     #[track_caller]
-    fn check_sent(outbox: &mut Outbox, expected: &[&str]) {
+    pub(super) fn check_sent(outbox: &mut Outbox, expected: &[&str]) {
         let mut sent = Vec::new();
         for message in take_all(outbox) {
             let mark = if message.retain { "" } else { "!" };
@@ -519,6 +453,43 @@ mod tests {
     }
 
     #[test]
+    fn a_thousand_devices_with_fifty_points_each_are_announced_within_ten_seconds() {
+        let mut outbox = outbox();
+        for device in 0..1000 {
+            for point in 0..50 {
+                retained(&mut outbox, &format!("busker/device_{device}/p{point}"), "1");
+            }
+            retained(&mut outbox, &format!("homeassistant/device/busker_device_{device}/config"), "{}");
+            retained(&mut outbox, &format!("busker/device_{device}/availability"), "online");
+        }
+        outbox.connected();
+        let mut now = LATER;
+        let mut announced = 0;
+        while announced < 1000 {
+            let messages = std::iter::from_fn(|| outbox.next_message(now));
+            announced += messages.filter(|message| message.topic.ends_with("/config")).count();
+            assert!(now - LATER < Duration::from_secs(10), "only {announced} devices are announced");
+            now = outbox.wake_at().expect("values wait");
+        }
+    }
+
+    #[test]
+    fn an_announcement_overtakes_values_that_wait_and_nothing_else_does() {
+        let mut outbox = outbox();
+        retained(&mut outbox, "busker/boiler/flow", "21.5");
+        once(&mut outbox, "busker/boiler/flow/outcome", "done");
+        retained(&mut outbox, "busker/boiler/availability", "online");
+        retained(&mut outbox, "homeassistant/device/busker_boiler/config", "{2}");
+        let expected = [
+            "homeassistant/device/busker_boiler/config {2}",
+            "busker/boiler/flow 21.5",
+            "busker/boiler/flow/outcome done!",
+            "busker/boiler/availability online",
+        ];
+        check_sent(&mut outbox, &expected);
+    }
+
+    #[test]
     fn what_could_not_be_handed_over_is_next_again_unless_it_is_old() {
         let mut outbox = outbox();
         retained(&mut outbox, "busker/a/x", "1");
@@ -542,75 +513,6 @@ mod tests {
         assert_eq!(outbox.next_message(LATER), Some(Message::retained("busker/a/x", "1")));
         assert_eq!(outbox.next_message(LATER), Some(Message::once("busker/a/x/outcome", "3")));
         assert_eq!(take_all(&mut outbox).len(), ONCE_MAX - 1);
-    }
-
-    /// What this gateway announces of a device with these components.
-    fn announcement(keys: &[&str]) -> String {
-        let components: Vec<String> =
-            keys.iter().map(|key| format!("\"{key}\":{{\"platform\":\"sensor\"}}")).collect();
-        format!(
-            "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
-             \"components\":{{{}}}}}",
-            components.join(",")
-        )
-    }
-
-    #[test]
-    fn what_an_earlier_run_announced_and_is_gone_is_taken_away() {
-        let config = "homeassistant/device/busker_boiler/config";
-        let (old, new) = (announcement(&["flow", "level"]), announcement(&["level"]));
-        // `flow` stands there as a tombstone, behind what is left.
-        let farewell = announcement(&["level", "flow"]);
-        let expected =
-            [format!("{config} {old}!"), format!("{config} {farewell}!"), format!("{config} {new}")];
-        let expected: Vec<&str> = expected.iter().map(String::as_str).collect();
-
-        // Found before it is announced anew, and after.
-        let mut early = outbox();
-        early.found(config, &old);
-        check_sent(&mut early, &[]);
-        retained(&mut early, config, &new);
-        check_sent(&mut early, &expected);
-        let mut late = outbox();
-        retained(&mut late, config, &new);
-        assert!(late.next_message(LATER).is_some());
-        late.found(config, &old);
-        check_sent(&mut late, &expected);
-        late.found(config, &new);
-        check_sent(&mut late, &[]);
-
-        // A device that is no longer there goes whole, once; others' are left alone.
-        let mut outbox = outbox();
-        outbox.found("homeassistant/device/busker_gone/config", &old);
-        outbox.found("homeassistant/device/busker_2_gone/config", &old.replace("busker/", "busker_2/"));
-        outbox.found("homeassistant/device/stranger/config", "{}");
-        let removal = outbox.next_message(LATER).expect("the device is removed");
-        outbox.put_back(removal);
-        check_sent(&mut outbox, &["homeassistant/device/busker_gone/config "]);
-    }
-
-    #[test]
-    fn what_was_taken_away_while_home_assistant_was_not_there_is_taken_away_again_once() {
-        let config = "homeassistant/device/busker_boiler/config";
-        let gone = "homeassistant/device/busker_gone/config";
-        let (old, new) = (announcement(&["flow", "level"]), announcement(&["level"]));
-        let mut outbox = outbox();
-        retained(&mut outbox, config, &new);
-        outbox.found(config, &old);
-        outbox.found(gone, &old);
-        take_all(&mut outbox);
-        outbox.home_assistant_started(Time::from_millis(0));
-        let farewell = announcement(&["level", "flow"]);
-        let expected = [
-            format!("{config} {old}!"),
-            format!("{config} {farewell}!"),
-            format!("{config} {new}"),
-            format!("{gone} {old}!"),
-            format!("{gone} "),
-        ];
-        check_sent(&mut outbox, &expected.each_ref().map(String::as_str));
-        outbox.home_assistant_started(Time::from_millis(60_000));
-        check_sent(&mut outbox, &[&expected[2]]);
     }
 
     #[test]

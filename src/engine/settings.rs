@@ -10,6 +10,7 @@ use std::sync::Arc;
 use crate::engine::address::Span;
 use crate::engine::device::{Device, PointIndex};
 use crate::engine::time::Duration;
+use crate::engine::units::Release;
 
 pub use self::mqtt::{ClientCertificate, Layout, Level, Manner, Mqtt, Tls};
 
@@ -61,6 +62,8 @@ pub struct HomeAssistant {
     pub prefix: String,
     /// `homeassistant/status`
     pub status_topic: String,
+    /// The oldest that must understand what it is told.
+    pub minimum_version: Release,
 }
 
 #[derive(Clone, PartialEq, Eq)]

@@ -4,6 +4,10 @@
 //! The tables are those of Home Assistant 2026.11 (`components/sensor/const.py`,
 //! `components/number/const.py`, `components/binary_sensor/__init__.py`).
 
+mod releases;
+
+pub use releases::{Release, known_since, spelt_for};
+
 use crate::engine::device::{Form, Kind, Names, Platform, Point, WriteRule};
 use crate::engine::yaml::nearest;
 
@@ -76,6 +80,15 @@ pub fn state_class(class: Option<&str>, unit: Option<&str>, signed: bool) -> Opt
     match states.first() {
         Some(&"total") if states.len() > 1 && !signed => Some("total_increasing"),
         first => first.copied(),
+    }
+}
+
+/// How many digits behind the dot people want to see of a float, which does not say how exact it is. Left
+/// to itself Home Assistant goes by the device class, and makes 3 V of 2.5.
+pub fn digits_of_a_float(unit: Option<&str>) -> u8 {
+    match unit {
+        Some("°C" | "°F" | "K" | "%" | "Ω" | "W" | "VA" | "var") => 1,
+        _ => 2,
     }
 }
 

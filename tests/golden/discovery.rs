@@ -4,6 +4,7 @@ use busker::engine::device::Device;
 use busker::engine::homeassistant::{Gateway, announcement};
 use busker::engine::settings::DeviceSettings;
 use busker::engine::topics::Topics;
+use busker::engine::units::Release;
 use serde_json::{Map, Value};
 
 /// A state of a profile's selectors: what it is called, and what which points hold. A name without
@@ -115,7 +116,8 @@ fn factory_settings(device: &Device) -> Vec<Option<i128>> {
 }
 
 fn payload(device: &Device, known: &[Option<i128>]) -> Value {
-    let gateway = Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into() };
+    let gateway =
+        Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into(), release: Release::USUAL };
     let settings = DeviceSettings {
         name: "device".into(),
         title: "Device".into(),

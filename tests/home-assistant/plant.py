@@ -141,8 +141,10 @@ def plant(busker: Busker, folder: pathlib.Path, ending: contextlib.ExitStack) ->
 class Gateway:
     """`busker run`, with a configuration that can be changed while it is stopped."""
 
-    def __init__(self, busker: Busker, folder: pathlib.Path, broker: "Broker", devices, ending) -> None:
+    def __init__(self, busker: Busker, folder: pathlib.Path, broker: "Broker", devices, ending, wishes: dict) -> None:
         self.busker, self.folder, self.broker, self.ending = busker, folder, broker, ending
+        # What the configuration says beside devices and their lines.
+        self.wishes = wishes
         self.devices = list(devices)
         self.start()
 
@@ -152,8 +154,7 @@ class Gateway:
             "mqtt": {"url": f"mqtt://127.0.0.1:{self.broker.port}"},
             "http": {"listen": None},
             "state_dir": f"{self.folder}/state",
-            # In minutes the test writes what a house writes in years.
-            "eeprom": {"interval": "0s", "daily": 10000},
+            **self.wishes,
             "buses": buses,
             "devices": {
                 device.name: {"profile": device.profile, "bus": device.line.name, "unit": device.unit,

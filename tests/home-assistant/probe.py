@@ -250,7 +250,11 @@ async def main(folder: pathlib.Path, broker_port: int) -> None:
 
 if __name__ == "__main__":
     os.dup2(2, 1)  # whatever else is printed must not look like an answer
-    loop = runner.create_event_loop(False)
+    if hasattr(runner, "create_event_loop"):
+        loop = runner.create_event_loop(False)
+    else:
+        # As it was before 2026.
+        loop = runner.HassEventLoopPolicy(False).new_event_loop()
     asyncio.set_event_loop(loop)
     loop.run_until_complete(main(pathlib.Path(sys.argv[1]), int(sys.argv[2])))
     answers.flush()

@@ -5,7 +5,7 @@ import pathlib
 
 KINDS = ("sensor", "enum", "binary_sensor", "switch", "number", "select", "button", "text", "event",
          "cover", "valve", "climate")
-BEGIN = "<!-- What follows is written by `BLESS=1 make test-home-assistant`. -->\n"
+BEGIN = "<!-- What follows is written by `BLESS=1 make test-home-assistant VERSION={}`. -->\n"
 END = "<!-- So far. -->\n"
 
 
@@ -24,13 +24,18 @@ class Report:
         print(f"  {seen}", flush=True)
         self.rows.append((what, seen))
 
-    def markdown(self) -> str:
+    def markdown(self, in_short: bool) -> str:
         about = self.about
         lines = [
             f"Seen with Home Assistant {about['home_assistant']} on Python {about['python']}, {about['broker']}.",
             "",
             *table(("what", "seen"), self.rows),
             "",
+        ]
+        return "\n".join(lines if in_short else lines + self.counts())
+
+    def counts(self) -> list[str]:
+        return [
             "Entities made of each profile in all of its modes that the run went through (a dash: none):",
             "",
             *self.entities(),
@@ -40,7 +45,6 @@ class Report:
             *table(("service", "calls"), [(f"`{service}`", str(count)) for service, count in sorted(self.services.items())]),
             "",
         ]
-        return "\n".join(lines)
 
     def entities(self) -> list[str]:
         devices = sorted({device for device, _ in self.made if device}) + ["busker and its lines"]
@@ -58,12 +62,13 @@ class Report:
     def kinds(self) -> set[str]:
         return {kind for (_, kind), ids in self.made.items() if ids}
 
-    def compare(self, page: pathlib.Path, bless: bool) -> bool:
-        """Whether the page says what was seen; writes it there when it is blessed."""
+    def compare(self, page: pathlib.Path, version: str, in_short: bool, bless: bool) -> bool:
+        """Whether the page says what was seen with this version; writes it there when it is blessed."""
         text = page.read_text()
-        before, rest = text.split(BEGIN)
-        _, after = rest.split(END)
-        now = before + BEGIN + self.markdown() + END + after
+        begin = BEGIN.format(version)
+        before, rest = text.split(begin)
+        _, after = rest.split(END, 1)
+        now = before + begin + self.markdown(in_short) + END + after
         if bless:
             page.write_text(now)
         return now == text or bless

@@ -1,17 +1,24 @@
 #!/bin/bash
-# Makes .home-assistant/ at the top of the repository: a real Home Assistant core with what its MQTT
+# Makes .home-assistant/VERSION/ at the top of the repository: a real Home Assistant core with what its MQTT
 # integration needs, from Debian's and Python's package registries. Nothing is installed on the machine:
-# where its Python is too old, Debian's newer one is unpacked there too. About 900 MB and three minutes;
-# the second time nothing, unless the version changed.
+# where it does not have the Python that this core asks for, Debian's is unpacked there too. About 830 MB and
+# two minutes for each version; the second time nothing. Prints the folder.
 set -euo pipefail
 
-home_assistant=${HOME_ASSISTANT_VERSION:-2026.11.0}
-python=${HOME_ASSISTANT_PYTHON:-3.14}          # the version that this Home Assistant asks for
-suite=${DEBIAN_SUITE:-forky}                   # the Debian suite that has it
+# The newest, and the oldest that busker's option `minimum_version` knows.
+version=${1:-2026.11}
+case $version in
+    2026.11) release=2026.11.0 python=3.14 suite=forky ;;
+    2025.4)  release=2025.4.4  python=3.13 suite=trixie ;;
+    *)
+        echo "No Home Assistant $version is set up here; VERSION is 2026.11 or 2025.4" >&2
+        exit 2
+        ;;
+esac
 
 top=$(cd "$(dirname "$0")/../.." && pwd)
-place=$top/.home-assistant
-ready=$place/ready-$home_assistant
+place=$top/.home-assistant/$version
+ready=$place/ready-$release
 export PIP_DISABLE_PIP_VERSION_CHECK=1
 
 main() {
@@ -20,7 +27,8 @@ main() {
     mkdir -p "$place"
     local interpreter
     interpreter=$(command -v "python$python" || true)
-    if [ -z "$interpreter" ]; then
+    # A version manager may answer to the name and have no such Python.
+    if [ -z "$interpreter" ] || ! "$interpreter" -c 'import ssl, sqlite3' 2>/dev/null; then
         unpack_python
         interpreter=$place/debian/usr/bin/python
     fi
@@ -46,7 +54,7 @@ unpack_python() {
     apt-get "${options[@]}" update
     # With no package marked as installed this takes all that they depend on, too.
     apt-get "${options[@]}" install --yes --download-only --no-install-recommends \
-        "python$python" python3-pip-whl >"$apt/log"
+        "python$python" "libpython$python-dev" python3-pip-whl >"$apt/log"
     for package in "$apt"/archives/*.deb; do
         dpkg-deb --extract "$package" "$debian"
     done
@@ -66,12 +74,15 @@ make_environment() {
     # The newest of Debian's pip, or the one that the machine's Python has.
     wheel=$(find "$place/debian" /usr/share/python-wheels -name 'pip-*.whl' 2>/dev/null | head -1)
     local pip=("$place/venv/bin/python" -m pip --quiet)
+    # What has no wheel for this Python is compiled; the machine's own headers come first.
+    export CFLAGS="-idirafter $place/debian/usr/include" CXXFLAGS="-idirafter $place/debian/usr/include"
     PYTHONPATH=$wheel "${pip[@]}" install pip
-    "${pip[@]}" install "homeassistant==$home_assistant"
+    "${pip[@]}" install "homeassistant==$release"
     # Home Assistant would install these itself at its first start; here nothing is downloaded at run time.
     "$place/venv/bin/python" "$top/tests/home-assistant/requirements.py" >"$place/requirements.txt"
     "${pip[@]}" install --constraint "$place/venv/lib/python$python/site-packages/homeassistant/package_constraints.txt" \
         --requirement "$place/requirements.txt"
 }
 
-main
+main >&2
+echo "$place"

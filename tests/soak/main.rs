@@ -1,6 +1,7 @@
 //! An hour of bus life with faults of every kind, in seconds: whatever is published was true between
 //! the request and its answer, each command has one outcome, and nothing moves without a command.
 
+mod dead_unit;
 mod device;
 mod world;
 

@@ -102,6 +102,12 @@ impl World {
         frames.map(|(_, _, frame)| format!("\n{frame}")).collect()
     }
 
+    /// All requests so far: when each was sent, and to which unit.
+    pub fn requests(&self) -> Vec<(Time, u8)> {
+        let requests = self.frames.iter().filter(|(.., frame)| frame.contains(" -> "));
+        requests.map(|(at, unit, _)| (*at, *unit)).collect()
+    }
+
     /// Lets time pass until `end`.
     pub fn run_until(&mut self, end: Time) {
         let mut steps_in_place = 0;

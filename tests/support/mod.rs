@@ -180,6 +180,11 @@ impl Busker {
         serde_json::from_str(&self.get(path)?).ok()
     }
 
+    /// The number of its process.
+    pub fn process(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Asks it to end, and waits for that.
     pub fn stop(&mut self) -> ExitStatus {
         let id = rustix::process::Pid::from_child(&self.child);

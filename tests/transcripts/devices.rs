@@ -10,6 +10,7 @@ use busker::engine::settings::{
     Password, Settings, Wanted,
 };
 use busker::engine::time::Duration;
+use busker::engine::units::Release;
 use busker::engine::value::Decimal;
 use busker::engine::yaml::Scalar;
 
@@ -65,6 +66,7 @@ pub fn settings(header: &str) -> Settings {
             discovery: says("discovery"),
             prefix: "homeassistant".into(),
             status_topic: "homeassistant/status".into(),
+            minimum_version: Release::USUAL,
         },
         http: Http { listen: None, token: Password::None },
         state_dir: "/nowhere".into(),
@@ -109,6 +111,11 @@ fn device(kind: &str) -> Device {
         "selectable" => selectable(),
         "thresholds" => thresholds(),
         "input" => input(),
+        "awakening" => {
+            let mut device = with(vec![point("level", register(Table::Input, 0, 1), Poll::Fast), order()]);
+            device.wire.connect_delay = Duration::from_millis(800);
+            device
+        }
         "identified" => {
             let mut device = with(vec![point("level", register(Table::Input, 0, 1), Poll::Fast), order()]);
             device.identify = Some(Identify::Names { vendor: "ACME".into(), product: "L1".into() });

@@ -48,6 +48,7 @@ pub fn device(device: &Device) -> Json {
             "fast_ms": wire.intervals.fast.as_millis() as u64,
             "slow_ms": wire.intervals.slow.as_millis() as u64,
         },
+        "connect_delay_ms": wire.connect_delay.as_millis() as u64,
         "response_timeout_ms": wire.response_timeout.map(|timeout| timeout.as_millis() as u64),
         "quirks": {
             "clamps_with_exception": wire.quirks.clamps_with_exception,

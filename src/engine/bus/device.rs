@@ -56,8 +56,8 @@ pub(super) struct DeviceState {
     wear: Wear,
     upkeep: Upkeep,
     keeping: Keeping,
-    /// How long the request in flight may wait.
-    asked_timeout: Duration,
+    /// How long a request may wait, as the bus and the profile ask for it.
+    full_timeout: Duration,
     /// Nothing is asked before.
     paused_until: Time,
     served_at: Time,
@@ -131,7 +131,7 @@ impl DeviceState {
             wear: Wear::new(eeprom),
             upkeep: Upkeep::default(),
             keeping: Keeping::default(),
-            asked_timeout: Duration::ZERO,
+            full_timeout: Duration::ZERO,
             paused_until: Time::default(),
             served_at: Time::default(),
             last_answer_end: Time::default(),
@@ -287,8 +287,8 @@ impl DeviceState {
     /// How long the next request may wait for its answer.
     pub(super) fn timeout(&mut self, of_bus: Duration) -> Duration {
         let demanded = self.settings.device.wire.response_timeout;
-        self.asked_timeout = self.patience.timeout(demanded.unwrap_or(of_bus).max(of_bus), demanded);
-        self.asked_timeout
+        self.full_timeout = demanded.unwrap_or(of_bus).max(of_bus);
+        self.patience.timeout(self.full_timeout, demanded)
     }
 
     pub(super) fn request(&self, call: Call) -> Request {
@@ -400,7 +400,8 @@ impl DeviceState {
 
     pub(super) fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         self.patience.unanswered();
-        self.paused_until = now + self.patience.pause(self.asked_timeout, self.settings.unit);
+        let demanded = self.settings.device.wire.response_timeout;
+        self.paused_until = now + self.patience.pause(self.full_timeout, demanded, self.settings.unit);
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {
             let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row");
             context.say(Severity::Warning, format!("device {} is offline: {reason}", self.settings.name));

@@ -1,10 +1,7 @@
 //! One bus as a state machine: what happened goes in, what to do comes out.
 //!
 //! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
-//! `ask_next` chooses the next: the command that has begun, heartbeats and watchdogs that are late, waiting commands,
-//! heartbeats and watchdogs, what somebody asked for, settings that are not as they are wanted, a scan, then whichever
-//! device's read (or identification) is most urgent. Nobody who asks without end keeps a read that is due from
-//! the wire: [`AHEAD_OF_READS`].
+//! `ask_next` in `turns` chooses the next.
 
 mod change;
 mod commands;
@@ -12,8 +9,10 @@ mod context;
 mod device;
 mod fetch;
 mod inbox;
+mod load;
 mod pause;
 mod requests;
+mod turns;
 mod waiting;
 
 use std::collections::VecDeque;
@@ -31,19 +30,16 @@ use crate::engine::topics::Message;
 
 use commands::{Active, Settling};
 use context::Context;
-use device::{DeviceState, Polled, Turn};
+use device::{DeviceState, Turn};
 use fetch::Fetch;
 pub use inbox::{Full, Inbox};
+use load::Load;
 use requests::Requests;
 pub use waiting::REPLACED;
 use waiting::{Target, WaitingCommands};
 
 /// After so many requests in a row that nobody answers, a TCP connection is made anew.
 const UNANSWERED_UNTIL_RENEWED: u32 = 5;
-/// So many requests in a row may go before a read that is due, because somebody wants them at once. Then
-/// the read has its turn: under a flood of commands every period stretches, but nothing starves.
-const AHEAD_OF_READS: u32 = 8;
-
 /// What can happen to a bus.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
@@ -137,6 +133,8 @@ pub struct Bus {
     /// Requests in a row that were wanted at once.
     ahead: u32,
     link_state: LinkState,
+    /// A device on this link needs silence behind a connect: nothing is asked before.
+    silent_until: Time,
     /// Requests in a row that no device on this link answered.
     unanswered: u32,
     broker_up: bool,
@@ -175,6 +173,8 @@ struct InFlight {
     sent_at: Time,
     /// What the device's turn was before, in case this is taken back.
     before: Option<Turn>,
+    /// Somebody wants it at once, while others wait for their turn.
+    out_of_turn: bool,
     /// A command may take its turn.
     gives_way: bool,
 }
@@ -230,6 +230,7 @@ impl Bus {
             in_flight: None,
             ahead: 0,
             link_state: LinkState::Down { reason: None, attempts: 0 },
+            silent_until: now,
             unanswered: 0,
             broker_up: true,
             counters,
@@ -296,6 +297,10 @@ impl Bus {
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
             return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
         }
+        if self.now < self.silent_until {
+            let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
+            return records.chain(expiring).chain([self.silent_until]).min();
+        }
         let of_devices =
             self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
         let spared =
@@ -352,6 +357,8 @@ impl Bus {
     // What happened to the link.
 
     fn link_up(&mut self) {
+        let delays = self.devices.iter().map(|device| device.device().wire.connect_delay);
+        self.silent_until = self.now + delays.max().unwrap_or_default();
         match std::mem::replace(&mut self.link_state, LinkState::Up) {
             // The devices are as silent as they were, and are asked as seldom.
             LinkState::Renewing => return,
@@ -400,6 +407,7 @@ impl Bus {
 
     fn reply(&mut self, reply: Reply) {
         let Some(in_flight) = self.in_flight.take() else { return };
+        self.count_turn(&in_flight);
         self.counters.count_result(&reply.result);
         self.counters.count_discarded(reply.discarded);
         self.load.add(in_flight.sent_at.max(reply.sent_at), self.now);
@@ -476,138 +484,6 @@ impl Bus {
         Some((index, self.devices[index].target_named(name)?))
     }
 
-    /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn.
-    fn make_way(&mut self) {
-        let gives_way = |in_flight: &InFlight| in_flight.gives_way;
-        if self.in_flight.as_ref().is_some_and(gives_way) && self.command_can_begin() {
-            self.context.actions.push_back(Action::Withdraw);
-        }
-    }
-
-    fn withdrawn(&mut self) {
-        let Some(in_flight) = self.in_flight.take() else { return };
-        if let (Purpose::Poll { read }, Some(device), Some(before)) =
-            (in_flight.purpose, in_flight.device, in_flight.before)
-        {
-            self.devices[device].take_back(read, before);
-        }
-    }
-
-    // What to ask next.
-
-    fn ask_next(&mut self) {
-        while self.in_flight.is_none() && self.link_state == LinkState::Up {
-            if let Some((device, point, call)) = self.beat.take() {
-                self.send(device, call, Purpose::BeatWrite(point));
-                continue;
-            }
-            if self.begin_overdue_read()
-                || self.begin_beat(true)
-                || self.feed(true)
-                || self.begin_command()
-                || self.begin_beat(false)
-                || self.feed(false)
-                || self.next_fetch()
-                || self.begin_request()
-                || self.begin_setting()
-                || self.next_scan()
-            {
-                continue;
-            }
-            let now = self.now;
-            let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-            let urgent = candidates.filter_map(|(index, device)| {
-                device.most_urgent(now).map(|(polled, urgency)| (index, polled, urgency, device.served_at()))
-            });
-            // Of two equally urgent ones, that which has waited longest.
-            let next = urgent.reduce(|best, other| {
-                let better = other.2 > best.2 || (other.2 == best.2 && other.3 < best.3);
-                if better { other } else { best }
-            });
-            let read_before_setting = std::mem::take(&mut self.wrote_setting);
-            let read_before_request = self.requests_go_on();
-            let Some((device, polled, ..)) = next else {
-                // Nothing is due: the next setting, or question of a request, need not wait for it.
-                if read_before_setting || read_before_request {
-                    continue;
-                }
-                return;
-            };
-            self.poll(device, polled);
-        }
-    }
-
-    fn poll(&mut self, device: usize, polled: Polled) {
-        let (call, purpose) = match polled {
-            Polled::Identification(call) => (call, Purpose::Identify),
-            Polled::Read(read, call) => (call, Purpose::Poll { read }),
-        };
-        self.send(device, call, purpose);
-    }
-
-    /// A read that is due, after [`AHEAD_OF_READS`] requests that went before it.
-    fn begin_overdue_read(&mut self) -> bool {
-        if self.ahead < AHEAD_OF_READS {
-            return false;
-        }
-        self.ahead = 0;
-        let now = self.now;
-        let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-        let overdue = candidates.filter_map(|(index, device)| {
-            let (polled, waited) = device.longest_waiting(now)?;
-            Some((index, polled, waited))
-        });
-        let longest = overdue.reduce(|best, other| if other.2 > best.2 { other } else { best });
-        let Some((device, polled, _)) = longest else { return false };
-        self.poll(device, polled);
-        self.ahead = 0;
-        self.in_flight.iter_mut().for_each(|in_flight| in_flight.gives_way = false);
-        true
-    }
-
-    /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.
-    fn begin_beat(&mut self, late: bool) -> bool {
-        if !self.feeds {
-            return false;
-        }
-        let now = self.now;
-        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-        let due = devices.find_map(|(index, device)| Some((index, device.beat_due(now, late)?)));
-        let Some((device, point)) = due else { return false };
-        let call = Call::Read(self.devices[device].details(point).at.span);
-        self.send(device, call, Purpose::BeatRead(point));
-        true
-    }
-
-    /// Asks a device something whose watchdog wants to be fed. If it is `late`, no command goes before.
-    fn feed(&mut self, late: bool) -> bool {
-        if !self.feeds {
-            return false;
-        }
-        let now = self.now;
-        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-        let due = devices.find_map(|(index, device)| Some((index, device.feed_due(now, late)?)));
-        let Some((device, read)) = due else { return false };
-        let ahead = self.ahead + 1;
-        self.poll(device, self.devices[device].read_call(read));
-        self.ahead = ahead;
-        self.in_flight.iter_mut().for_each(|in_flight| in_flight.gives_way &= !late);
-        true
-    }
-
-    /// Not a device that leaves. And one whose watchdog must run out is not spoken to while the broker is away.
-    fn may_ask(&self, device: &DeviceState) -> bool {
-        let is_to_be_fed =
-            self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.wants_feeding();
-        is_to_be_fed && !device.is_leaving
-    }
-
-    /// What any device has.
-    fn look_what_they_have(&mut self) {
-        self.feeds = self.devices.iter().any(DeviceState::wants_feeding);
-        self.has_settings = self.devices.iter().any(DeviceState::has_settings);
-    }
-
     fn remember(&mut self) {
         for device in &mut self.devices {
             if let Some(record) = device.record(self.now, self.stopping) {
@@ -616,75 +492,9 @@ impl Bus {
         }
         self.record_due_at = self.devices.iter().filter_map(DeviceState::record_due_at).min();
     }
-
-    fn send(&mut self, device: usize, call: Call, purpose: Purpose) {
-        let state = &mut self.devices[device];
-        let before = match purpose {
-            Purpose::Poll { read } => state.begin_read(read, self.now),
-            _ => state.turn(),
-        };
-        let gives_way = matches!(purpose, Purpose::Poll { .. });
-        match purpose {
-            Purpose::Command | Purpose::Fetch | Purpose::BeatRead(_) => self.ahead += 1,
-            Purpose::Poll { .. } if before.was_wanted() => self.ahead += 1,
-            Purpose::Poll { .. } => self.ahead = 0,
-            _ => {}
-        }
-        let timeout = state.timeout(self.response_timeout);
-        let not_before = state.asked(self.now);
-        let request = state.request(call);
-        self.in_flight = Some(InFlight {
-            device: Some(device),
-            purpose,
-            sent_at: not_before,
-            before: Some(before),
-            gives_way,
-        });
-        self.context.actions.push_back(Action::Send { request, not_before, timeout });
-    }
-
-    /// Asks a unit that is no device of this gateway.
-    fn send_stranger(&mut self, request: Request, purpose: Purpose) {
-        let (now, timeout) = (self.now, self.response_timeout);
-        self.in_flight =
-            Some(InFlight { device: None, purpose, sent_at: now, before: None, gives_way: false });
-        self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
-    }
 }
 
 /// What a read costs, until a device's own latency is measured.
 fn cost(link: &Link) -> Cost {
     Cost::of(link, Duration::from_millis(5))
-}
-
-/// The share of time in which the wire is busy: two buckets of a minute.
-#[derive(Clone, Copy, Debug, Default)]
-struct Load {
-    minute: u64,
-    busy: Duration,
-    busy_before: Option<Duration>,
-}
-
-impl Load {
-    const MINUTE: u64 = 60_000_000;
-
-    fn add(&mut self, from: Time, until: Time) {
-        let minute = until.0 / Load::MINUTE;
-        if minute != self.minute {
-            self.busy_before = Some(if minute == self.minute + 1 { self.busy } else { Duration::ZERO });
-            (self.minute, self.busy) = (minute, Duration::ZERO);
-        }
-        self.busy += until - from;
-    }
-
-    /// 0 to 1, over the last whole minute; before there is one, since the start.
-    fn share(&self, now: Time) -> f64 {
-        let (busy, time) = match (self.busy_before, now.0 / Load::MINUTE) {
-            (_, minute) if minute > self.minute + 1 => (Duration::ZERO, Duration::from_secs(60)),
-            (_, minute) if minute == self.minute + 1 => (self.busy, Duration::from_secs(60)),
-            (Some(before), _) => (before, Duration::from_secs(60)),
-            (None, _) => (self.busy, now - Time::default()),
-        };
-        if time.is_zero() { 0.0 } else { (busy.as_secs_f64() / time.as_secs_f64()).min(1.0) }
-    }
 }

@@ -14,6 +14,7 @@ use crate::engine::device::Poll;
 use crate::engine::profile::file::{Intervals, Point, Presentation, Thing, Wire};
 use crate::engine::settings::{Layout, OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
+use crate::engine::units::Release;
 use crate::engine::value::Decimal;
 use crate::engine::yaml::{At, Content, Definitions, Faults, Json, Map, Node, Read, Scalar, record};
 
@@ -102,6 +103,9 @@ record! {
         prefix: At<Topic> = At::nowhere(Topic("homeassistant".into())),
         /// Where Home Assistant says that it has started.
         status_topic: At<Topic> = At::nowhere(Topic("homeassistant/status".into())),
+        /// The oldest Home Assistant that is to understand it, in quotes: `"2025.4"`. An older one knows fewer
+        /// device classes, and takes ids under another name.
+        minimum_version: At<Release> = At::nowhere(Release::USUAL),
     }
 }
 

@@ -23,6 +23,7 @@ use crate::engine::settings::{
     Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Level, Line, Link, Parity, Password, Settings, Wanted,
 };
 use crate::engine::time::Duration;
+use crate::engine::units::Release;
 use crate::engine::yaml::{
     At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, nearest, parse,
     read, schema_of,
@@ -41,7 +42,7 @@ pub fn load(
     let source = Source::from_bytes(file_name, bytes, &mut faults);
     let node = source.as_ref().and_then(|source| parse(source, &mut faults));
     let file: Option<Configuration> = node.and_then(|node| read(&node, &mut faults));
-    let mut resolver = Resolver { library, faults, warnings: Faults::default() };
+    let mut resolver = Resolver { library, faults, warnings: Faults::default(), release: Release::USUAL };
     let settings = file.and_then(|file| resolver.settings(&file));
     let Resolver { mut faults, mut warnings, .. } = resolver;
     if let Some(source) = source {
@@ -103,6 +104,8 @@ struct Resolver<'a> {
     library: &'a Library,
     faults: Faults,
     warnings: Faults,
+    /// The oldest Home Assistant that must know the device classes.
+    release: Release,
 }
 
 impl Resolver<'_> {
@@ -117,6 +120,8 @@ impl Resolver<'_> {
             );
         }
         self.within(file.republish.get(), Duration::from_secs(1), Duration::from_secs(86_400));
+        let home_assistant = section(&file.home_assistant).map(|section| home_assistant(&section));
+        self.release = home_assistant.as_ref().map_or(Release::USUAL, |section| section.minimum_version);
         let mqtt = section(&file.mqtt).map(|mqtt| self.mqtt(&mqtt));
         let eeprom = section(&file.eeprom).map(|eeprom| self.eeprom(&eeprom));
         let http = section(&file.http).map(|http| self.http(&http));
@@ -125,7 +130,7 @@ impl Resolver<'_> {
         // Each `?` stands for a fault that has been noted.
         Some(Settings {
             mqtt: mqtt?,
-            home_assistant: home_assistant(&section(&file.home_assistant)?),
+            home_assistant: home_assistant?,
             http: http?,
             state_dir: PathBuf::from(&file.state_dir.get()?.value),
             republish: file.republish.get()?.value,
@@ -438,7 +443,7 @@ impl Resolver<'_> {
             self.intervals(poll, &mut device);
         }
         if let (Some(_), Some(points)) = (&file.profile, &file.points) {
-            wishes::apply(&points.0, &mut device, &mut self.faults, &mut self.warnings);
+            wishes::apply(&points.0, &mut device, self.release, &mut self.faults, &mut self.warnings);
         }
         Some(device)
     }
@@ -466,7 +471,11 @@ impl Resolver<'_> {
             wire: file.wire.as_ref().map(|wire| &wire.node),
             home_assistant: file.home_assistant.as_ref().map(|looks| &looks.node),
         };
-        profile::load_inline(&inline, self.library, &mut self.faults)
+        let device = profile::load_inline(&inline, self.library, &mut self.faults)?;
+        if let Some(looks) = &file.home_assistant {
+            wishes::check_release(&device, self.release, looks.node.named_at(), &mut self.faults);
+        }
+        Some(device)
     }
 
     fn intervals(&mut self, file: &Intervals, device: &mut Device) {
@@ -513,6 +522,7 @@ fn home_assistant(file: &file::HomeAssistant) -> HomeAssistant {
         discovery: file.discovery,
         prefix: file.prefix.0.clone(),
         status_topic: file.status_topic.0.clone(),
+        minimum_version: file.minimum_version.value,
     }
 }
 

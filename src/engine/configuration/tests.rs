@@ -89,7 +89,7 @@ fn every_key_has_its_place() {
         "
 mqtt: {url: 'mqtt://[fe80::1]:1884', username: busker, password_file: /p, base_topic: house/busker,
        keep_alive: 1m}
-home_assistant: {discovery: false, prefix: ha, status_topic: ha/up}
+home_assistant: {discovery: false, prefix: ha, status_topic: ha/up, minimum_version: '2025.4'}
 http: {listen: 'localhost:0', token: s3cret}
 state_dir: /tmp/state
 republish: 1h
@@ -108,7 +108,12 @@ devices:
     assert!(settings.mqtt.password == Password::File("/p".into()));
     assert_eq!(
         settings.home_assistant,
-        HomeAssistant { discovery: false, prefix: "ha".into(), status_topic: "ha/up".into() }
+        HomeAssistant {
+            discovery: false,
+            prefix: "ha".into(),
+            status_topic: "ha/up".into(),
+            minimum_version: Release::OLDEST,
+        }
     );
     assert_eq!(settings.http.listen.as_deref(), Some("localhost:0"));
     assert!(settings.http.token == Password::Given("s3cret".into()));

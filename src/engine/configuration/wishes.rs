@@ -5,15 +5,20 @@ use crate::engine::device::{
     self, Condition, Device, Encoding, Form, Kind, Names, Point, PointIndex, Poll, Thing, Unit,
 };
 use crate::engine::profile::file;
-use crate::engine::units;
-use crate::engine::yaml::{At, Faults, Map, Node, list_of_choices, nearest, read};
+use crate::engine::units::{self, Release};
+use crate::engine::yaml::{At, Faults, Map, Node, Place, list_of_choices, nearest, read};
 
 /// Applies the wishes in `node`, a map from names of points.
-pub fn apply(node: &Node, device: &mut Device, faults: &mut Faults, warnings: &mut Faults) {
+pub fn apply(node: &Node, device: &mut Device, release: Release, faults: &mut Faults, warnings: &mut Faults) {
     let Some(wishes): Option<Map<String, PointWish>> = read(node, faults) else { return };
     for (name, wish) in wishes.iter() {
         match device.points.iter().position(|point| point.name == name.value) {
-            Some(point) => apply_one(point, wish, device, faults, warnings),
+            Some(point) => {
+                apply_one(point, wish, device, faults, warnings);
+                if let Some(class) = &wish.presentation.device_class {
+                    check_release_of(&device.points[point], release, &class.place, faults);
+                }
+            }
             None => match device.things.iter_mut().find(|thing| thing.name == name.value) {
                 Some(thing) => apply_to_thing(thing, wish, faults),
                 None => faults.add(&name.place, unknown_point(name, device)),
@@ -265,6 +270,32 @@ fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults) {
             faults.add(place, message);
             return;
         }
+    }
+}
+
+/// No class that a device's own points ask for may be newer than the oldest Home Assistant that must know it.
+pub fn check_release(device: &Device, release: Release, place: &Place, faults: &mut Faults) {
+    for point in &device.points {
+        check_release_of(point, release, place, faults);
+    }
+}
+
+fn check_release_of(point: &Point, release: Release, place: &Place, faults: &mut Faults) {
+    let Some(class) = point.presentation.device_class.as_deref() else { return };
+    let since = forms(point).map(|form| match &form.unit {
+        Unit::Fixed(unit) => (units::known_since(class, Some(unit)), Some(unit)),
+        Unit::None | Unit::By(_) => (units::known_since(class, None), None),
+    });
+    if let Some((since, unit)) = since.filter(|(since, _)| *since > release).max() {
+        let of = unit.map(|unit| format!(" in `{unit}`")).unwrap_or_default();
+        faults.add(
+            place,
+            format!(
+                "Home Assistant knows `{class}`{of} since {since}, but `{name}` is to be understood by {release}; \
+                 say `minimum_version: \"{since}\"` under `home_assistant`, or leave the class out",
+                name = point.name,
+            ),
+        );
     }
 }
 

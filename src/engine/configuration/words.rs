@@ -3,6 +3,7 @@
 use serde_json::json;
 
 use crate::engine::settings::{self, Layout, OnBrokerLoss, Parity};
+use crate::engine::units::Release;
 use crate::engine::yaml::{Definitions, Faults, Json, Node, Read, Scalar, choices};
 
 choices! { "a parity", Parity { "none" => Parity::None, "even" => Parity::Even, "odd" => Parity::Odd } }
@@ -112,6 +113,32 @@ impl Scalar for StopBits {
 
     fn schema() -> Json {
         json!({"enum": [1, 2]})
+    }
+}
+
+impl Scalar for Release {
+    const EXPECTED: &'static str = "a release of Home Assistant like `2025.11`";
+
+    fn parse(text: &str) -> Result<Release, String> {
+        let mut parts = text.split('.');
+        let year = parts.next().and_then(|year| year.parse().ok()).filter(|year| (2000..2100).contains(year));
+        let month =
+            parts.next().and_then(|month| month.parse().ok()).filter(|month| (1..=12).contains(month));
+        // `2025.4.4` is the fourth mending of 2025.4.
+        let rest = parts.all(|part| !part.is_empty() && part.chars().all(|c| c.is_ascii_digit()));
+        let (Some(year), Some(month), true) = (year, month, rest) else {
+            return Err(format!("`{text}` is no release of Home Assistant; expected one like `2025.11`"));
+        };
+        let release = Release { year, month };
+        if release < Release::OLDEST {
+            let oldest = Release::OLDEST;
+            return Err(format!("Home Assistant {release} is too old; expected {oldest} or a later one"));
+        }
+        Ok(release)
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": r"^20[0-9]{2}\.[0-9]{1,2}(\.[0-9]+)?$"})
     }
 }
 

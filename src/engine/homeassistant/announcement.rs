@@ -6,10 +6,12 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use serde_json::{Map, Value, json};
 
 use super::entity::{Entity, companions, entity, sentence};
+use super::release;
 use super::thing::thing_component;
 use crate::engine::device::Platform;
 use crate::engine::settings::{self, DeviceSettings};
 use crate::engine::topics::{self, DeviceTopics, Message, Topics};
+use crate::engine::units::Release;
 
 /// What all announcements of one gateway have in common.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,11 +19,17 @@ pub struct Gateway {
     pub topics: Topics,
     /// Where Home Assistant looks: `homeassistant`.
     pub prefix: String,
+    /// The oldest that must understand it.
+    pub release: Release,
 }
 
 impl Gateway {
     pub fn new(mqtt: &settings::Mqtt, home_assistant: &settings::HomeAssistant) -> Gateway {
-        Gateway { topics: Topics::of(mqtt), prefix: home_assistant.prefix.clone() }
+        Gateway {
+            topics: Topics::of(mqtt),
+            prefix: home_assistant.prefix.clone(),
+            release: home_assistant.minimum_version,
+        }
     }
 
     /// The part that says who speaks; Home Assistant refuses a message without it.
@@ -48,8 +56,11 @@ impl Announcement {
         identity: &str,
         device: Value,
         availability: &[String],
-        components: Components,
+        mut components: Components,
     ) -> Announcement {
+        for (_, component) in &mut components {
+            release::fit(component, gateway.release);
+        }
         let mut head = Map::new();
         head.insert("device".into(), device);
         head.insert("origin".into(), gateway.origin());
@@ -281,7 +292,7 @@ mod tests {
     use crate::engine::test_device::device_of;
 
     fn gateway() -> Gateway {
-        Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into() }
+        Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into(), release: Release::USUAL }
     }
 
     /// A relay, and an input that is °C or V as its mode (0, 1, 2: none) says.

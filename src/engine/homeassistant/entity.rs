@@ -221,7 +221,7 @@ fn button_beside(device: &Device, point: &Point, main: &Entity, name: &str) -> E
     Entity {
         key,
         platform: Platform::Button,
-        name: format!("{} {}", main.name, name.replace('_', " ")),
+        name: format!("{}: {}", main.name, name.replace('_', " ")),
         device_class: None,
         unit: None,
         state_class: None,
@@ -257,7 +257,8 @@ fn describe_number(entity: &mut Entity, point: &Point, resolved: &Resolved) {
             .clone()
             .filter(|wished| units::check(Platform::Sensor, class, unit.as_deref(), Some(wished)).is_ok())
             .or_else(|| derived_state_class(point, resolved, class, unit.as_deref()).map(str::to_string));
-        entity.precision = resolved.display_precision();
+        let of_a_float = || resolved.form.kind.is_float().then(|| units::digits_of_a_float(unit.as_deref()));
+        entity.precision = resolved.display_precision().or_else(of_a_float);
     } else {
         let limits = point.write.as_ref().and_then(|write| codec::limits(resolved, &write.rule));
         if let Some(limits) = limits {
@@ -458,7 +459,9 @@ mod tests {
         );
         check_entity(
             point_with(form(Kind::F32, "%"), None, NOTHING),
-            &["sensor flow_value: unit_of_measurement=% state_class=measurement"],
+            &[
+                "sensor flow_value: unit_of_measurement=% state_class=measurement suggested_display_precision=1",
+            ],
         );
         check_entity(
             point_with(Form::new(Kind::U48), None, NOTHING),

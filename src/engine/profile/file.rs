@@ -68,6 +68,8 @@ record! {
         poll: Option<Intervals>,
         /// How long to wait for a reply, if the device needs more than the bus is set to.
         response_timeout: Option<Duration>,
+        /// Silence that the device needs behind a connect, before the first request.
+        connect_delay: Option<Duration>,
         /// Where the device departs from the Modbus specification.
         quirks: Vec<Quirk> = Vec::new(),
         /// The point that holds the time after which outputs fall to their safe state unless a message comes.

@@ -418,6 +418,7 @@ impl Resolution<'_, '_> {
             resolved.intervals.slow = poll.slow.as_ref().map_or(defaults.slow, |slow| slow.value);
         }
         resolved.response_timeout = wire.response_timeout;
+        resolved.connect_delay = wire.connect_delay.unwrap_or_default();
         resolved.quirks = Quirks {
             clamps_with_exception: wire.quirks.contains(&Quirk::ClampsWithException),
             exception_function_varies: wire.quirks.contains(&Quirk::ExceptionFunctionVaries),

@@ -389,6 +389,9 @@ devices:
         if !limits.delay.is_zero() {
             rows.push(("Silence before each question", words::duration(limits.delay)));
         }
+        if !wire.connect_delay.is_zero() {
+            rows.push(("Silence behind a connect", words::duration(wire.connect_delay)));
+        }
         let waited = match wire.response_timeout {
             Some(timeout) => format!("at least {}; longer if the bus says so", words::duration(timeout)),
             None => "as long as the bus says (`response_timeout`)".into(),

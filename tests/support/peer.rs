@@ -1,6 +1,8 @@
 //! The far end of a line: devices that hold registers, answer rightly, and misbehave once or always
 //! when a test says so. Its frames are made here and not by the program's own code.
 
+#![allow(dead_code, reason = "each test uses its own part of it")]
+
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -8,8 +10,9 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
+use busker::edge::clock::Clock;
+use busker::engine::time::{Duration, Time};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
@@ -21,6 +24,19 @@ pub struct Asked {
     pub unit: u8,
     pub function: u8,
     pub address: u16,
+    /// How long the line had been silent before it: never less than it really was.
+    pub silence: Duration,
+    /// The connection it came on (the first has number 0), and how old that was.
+    pub connection: usize,
+    pub connected_for: Duration,
+}
+
+impl Asked {
+    /// The second number of the request: the count of a read, the word of a write.
+    pub fn argument(&self, framing: Framing) -> u16 {
+        let pdu = pdu_of(&self.frame, framing);
+        u16::from_be_bytes([pdu[3], pdu[4]])
+    }
 }
 
 /// What the far end does when it is asked.
@@ -30,10 +46,18 @@ pub enum Step {
     Pause(u64),
     /// Says it just before it answers the next request.
     SayBeforeNext(Vec<u8>),
+    /// Closes the connection.
+    HangUp,
 }
 
 /// Makes something else of a request (and of the right reply to it, an empty one to a broadcast).
 pub type Misbehave = fn(&Asked, Vec<u8>) -> Vec<Step>;
+
+/// The same with a memory.
+type Behaviour = Box<dyn FnMut(&Asked, Vec<u8>) -> Vec<Step> + Send>;
+
+/// Unit, function of the read, and address of a register.
+pub type Place = (u8, u8, u16);
 
 /// The kind of frames on the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,13 +68,24 @@ pub enum Framing {
 
 #[derive(Default)]
 struct State {
-    /// By unit, function of the read, and address.
-    registers: BTreeMap<(u8, u8, u16), u16>,
-    once: Option<(Asked, Misbehave)>,
-    always: Option<Misbehave>,
+    registers: BTreeMap<Place, u16>,
+    /// What each register has held, in the order of the changes.
+    held: Vec<(Place, u16)>,
+    once: Option<(Place, Misbehave)>,
+    always: Option<Behaviour>,
     before_next: Vec<u8>,
     deaf_to_writes: bool,
+    /// Which writes are obeyed; `None`: all.
+    obeys: Option<fn(&Asked) -> bool>,
     asked: Vec<Asked>,
+    connections: usize,
+}
+
+impl State {
+    fn put(&mut self, place: Place, word: u16) {
+        self.registers.insert(place, word);
+        self.held.push((place, word));
+    }
 }
 
 /// Devices on a pseudo-terminal (behind a symbolic link that stays) or a TCP port.
@@ -147,23 +182,52 @@ impl Peer {
 
     /// Sets what a unit holds, by the function code that reads it.
     pub fn hold(&self, unit: u8, function: u8, address: u16, word: u16) {
-        self.lock().registers.insert((unit, function, address), word);
+        self.lock().put((unit, function, address), word);
+    }
+
+    /// The same for several registers at once.
+    pub fn hold_all(&self, unit: u8, function: u8, address: u16, words: &[u16]) {
+        let mut state = self.lock();
+        for (word, address) in words.iter().zip(address..) {
+            state.put((unit, function, address), *word);
+        }
+    }
+
+    /// What a register holds.
+    pub fn holds(&self, place: Place) -> u16 {
+        self.lock().registers.get(&place).copied().unwrap_or_default()
+    }
+
+    /// Everything that a register has held.
+    pub fn history(&self, place: Place) -> Vec<u16> {
+        let state = self.lock();
+        let of_place = state.held.iter().filter(|(of, _)| *of == place);
+        of_place.map(|(_, word)| *word).collect()
     }
 
     /// Misbehaves once, at the next request to this unit, function and address.
     pub fn misbehave_once(&self, unit: u8, function: u8, address: u16, how: Misbehave) {
-        let asked = Asked { frame: Vec::new(), unit, function, address };
-        self.lock().once = Some((asked, how));
+        self.lock().once = Some(((unit, function, address), how));
     }
 
     /// Misbehaves at every request from now on.
-    pub fn misbehave(&self, how: Misbehave) {
-        self.lock().always = Some(how);
+    pub fn misbehave(&self, how: impl FnMut(&Asked, Vec<u8>) -> Vec<Step> + Send + 'static) {
+        self.lock().always = Some(Box::new(how));
+    }
+
+    /// The end of [`Peer::misbehave`].
+    pub fn behave(&self) {
+        self.lock().always = None;
     }
 
     /// The units hear no write any more, and so neither obey nor confirm one.
     pub fn be_deaf_to_writes(&self) {
         self.lock().deaf_to_writes = true;
+    }
+
+    /// Of the writes only those are obeyed that fit; whether the others are refused is another matter.
+    pub fn obey(&self, fits: fn(&Asked) -> bool) {
+        self.lock().obeys = Some(fits);
     }
 
     /// Whether the misbehaviour of [`Peer::misbehave_once`] has happened.
@@ -174,6 +238,11 @@ impl Peer {
     /// Every request so far.
     pub fn asked(&self) -> Vec<Asked> {
         self.lock().asked.clone()
+    }
+
+    /// How many connections there have been.
+    pub fn connections(&self) -> usize {
+        self.lock().connections
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
@@ -235,19 +304,40 @@ impl AsFd for Line {
 }
 
 fn serve(line: &mut Line, framing: Framing, state: &Mutex<State>, plugged: &Mutex<bool>) {
+    let clock = Clock::start();
+    let connection = {
+        let mut state = state.lock().expect("nobody panics with it");
+        state.connections += 1;
+        state.connections - 1
+    };
     let mut heard = Vec::new();
+    let (mut busy_until, mut silence) = (Time::default(), Duration::ZERO);
     while *plugged.lock().expect("nobody panics with it") {
         let Some(bytes) = line.read() else { return };
+        if bytes.is_empty() {
+            continue;
+        }
+        if heard.is_empty() {
+            silence = clock.now() - busy_until;
+        }
+        busy_until = clock.now();
         heard.extend(bytes);
         while let Some(asked) = take_request(&mut heard, framing) {
+            let connected_for = clock.now() - Time::default();
+            let asked = Asked { silence, connection, connected_for, ..asked };
             let steps = steps(&asked, framing, &mut state.lock().expect("nobody panics with it"));
             for step in steps {
                 match step {
-                    Step::Say(bytes) => line.write(&bytes),
+                    Step::Say(bytes) => {
+                        // Before, or the program might have heard it before this is told the time.
+                        busy_until = clock.now();
+                        line.write(&bytes);
+                    }
                     Step::Pause(millis) => std::thread::sleep(Duration::from_millis(millis)),
                     Step::SayBeforeNext(bytes) => {
                         state.lock().expect("nobody panics with it").before_next = bytes;
                     }
+                    Step::HangUp => return,
                 }
             }
         }
@@ -256,27 +346,29 @@ fn serve(line: &mut Line, framing: Framing, state: &Mutex<State>, plugged: &Mute
 
 fn steps(asked: &Asked, framing: Framing, state: &mut State) -> Vec<Step> {
     state.asked.push(asked.clone());
-    let fits = |once: &(Asked, Misbehave)| {
-        (once.0.unit, once.0.function, once.0.address) == (asked.unit, asked.function, asked.address)
-    };
-    let once = if state.once.as_ref().is_some_and(fits) { state.once.take() } else { None };
+    let place = (asked.unit, asked.function, asked.address);
+    let once = state.once.take_if(|(at, _)| *at == place);
     let mut steps = Vec::new();
     if !state.before_next.is_empty() {
         steps.extend([Step::Say(std::mem::take(&mut state.before_next)), Step::Pause(15)]);
     }
     let reply = right_reply(asked, framing, state);
-    steps.extend(match once.map(|(_, how)| how).or(state.always) {
-        Some(how) => how(asked, reply),
-        None if reply.is_empty() => Vec::new(),
-        None => vec![Step::Say(reply)],
+    steps.extend(match (once, &mut state.always) {
+        (Some((_, how)), _) => how(asked, reply),
+        (None, Some(how)) => how(asked, reply),
+        (None, None) if reply.is_empty() => Vec::new(),
+        (None, None) => vec![Step::Say(reply)],
     });
     steps
 }
 
 fn right_reply(asked: &Asked, framing: Framing, state: &mut State) -> Vec<u8> {
     let pdu = pdu_of(&asked.frame, framing);
-    if state.deaf_to_writes && matches!(asked.function, 5 | 6) {
+    if state.deaf_to_writes && matches!(asked.function, 5 | 6 | 15 | 16) {
         return Vec::new();
+    }
+    if matches!(asked.function, 5 | 6 | 15 | 16) && state.obeys.is_some_and(|obeys| !obeys(asked)) {
+        return reply(asked, framing, &pdu[..5]);
     }
     let number = |at: usize| u16::from_be_bytes([pdu[at], pdu[at + 1]]);
     match asked.function {
@@ -288,12 +380,25 @@ fn right_reply(asked: &Asked, framing: Framing, state: &mut State) -> Vec<u8> {
             reply(asked, framing, &read_pdu(asked.function, &words))
         }
         5 => {
-            state.registers.insert((asked.unit, 1, asked.address), u16::from(number(3) == 0xFF00));
+            state.put((asked.unit, 1, asked.address), u16::from(number(3) == 0xFF00));
             reply(asked, framing, &pdu)
         }
         6 => {
-            state.registers.insert((asked.unit, 3, asked.address), number(3));
+            state.put((asked.unit, 3, asked.address), number(3));
             reply(asked, framing, &pdu)
+        }
+        15 => {
+            for number in 0..number(3) {
+                let bit = pdu[6 + usize::from(number / 8)] >> (number % 8) & 1;
+                state.put((asked.unit, 1, asked.address + number), bit.into());
+            }
+            reply(asked, framing, &pdu[..5])
+        }
+        16 => {
+            for (word, address) in pdu[6..].chunks(2).zip(asked.address..) {
+                state.put((asked.unit, 3, address), u16::from_be_bytes([word[0], word[1]]));
+            }
+            reply(asked, framing, &pdu[..5])
         }
         8 => reply(asked, framing, &pdu),
         17 => reply(asked, framing, &[17, 3, b'B', b'1', 0xFF]),
@@ -315,6 +420,11 @@ pub fn read_pdu(function: u8, words: &[u16]) -> Vec<u8> {
         _ => words.iter().flat_map(|word| word.to_be_bytes()).collect(),
     };
     [&[function, bytes.len() as u8], &bytes[..]].concat()
+}
+
+/// A refusal.
+pub fn exception(asked: &Asked, framing: Framing, code: u8) -> Vec<u8> {
+    reply(asked, framing, &[asked.function | 0x80, code])
 }
 
 /// The frame that carries `pdu` as the answer; empty to a broadcast.
@@ -371,5 +481,7 @@ fn take_request(heard: &mut Vec<u8>, framing: Framing) -> Option<Asked> {
     let frame: Vec<u8> = heard.drain(..length).collect();
     let at = if framing == Framing::Tcp { 6 } else { 0 };
     let address = frame.get(at + 2..at + 4).map_or(0, |bytes| u16::from_be_bytes([bytes[0], bytes[1]]));
-    Some(Asked { unit: frame[at], function: frame[at + 1], address, frame })
+    let (unit, function) = (frame[at], frame[at + 1]);
+    let (silence, connected_for) = (Duration::ZERO, Duration::ZERO);
+    Some(Asked { unit, function, address, frame, silence, connected_for, connection: 0 })
 }

@@ -1,0 +1,307 @@
+//! Performs what [`crate::engine::bus::Bus`] decides: its letters, its link from closed to open and back, and
+//! the messages that it publishes. It waits for nothing; its thread does ([`crate::edge::bus_thread`]).
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use crate::edge::bell::Bell;
+use crate::edge::clock::Clock;
+use crate::edge::guarded_link::GuardedLink;
+use crate::edge::link::{Link, Lost};
+use crate::edge::state_files::StateFiles;
+use crate::engine::bus::{Action, Bus, Event, Inbox, Severity};
+use crate::engine::modbus::Reply;
+use crate::engine::modbus::guard::Guard;
+use crate::engine::settings::Settings;
+use crate::engine::time::Time;
+use crate::engine::topics::Message;
+
+/// Looks that may wait for a bus.
+pub(super) const LOOKS_MAX: usize = 64;
+
+/// Something that looks at the bus on its thread.
+pub(super) type Look = Box<dyn FnOnce(&Bus, Time) + Send>;
+
+/// The near end of a handle's ways to its bus.
+pub(super) struct Ears {
+    pub(super) inbox: Arc<Mutex<Inbox>>,
+    pub(super) looks: Receiver<Look>,
+    pub(super) bell: Bell,
+    pub(super) stop: Arc<AtomicBool>,
+    pub(super) stirred: Arc<AtomicBool>,
+    pub(super) ended: SyncSender<()>,
+}
+
+/// The link, from closed to open and back.
+enum Port {
+    Closed,
+    /// To be opened then.
+    Waiting(Time),
+    /// Being opened by a thread of its own, because that may take seconds.
+    Opening(Receiver<Result<Link, Lost>>),
+    Open(Box<GuardedLink>),
+}
+
+/// A bus and its link. Whoever runs it calls [`BusRunner::begin`], waits for what comes first of bytes
+/// ([`BusRunner::link`]), the bell and [`BusRunner::wake_at`], calls [`BusRunner::woken`], and so on until
+/// [`BusRunner::is_finished`].
+pub(super) struct BusRunner {
+    settings: Arc<Settings>,
+    index: usize,
+    clock: Clock,
+    state: Arc<StateFiles>,
+    publish: Box<dyn Fn(Message) + Send>,
+    bus: Bus,
+    port: Port,
+    inbox: Arc<Mutex<Inbox>>,
+    looks: Receiver<Look>,
+    bell: Bell,
+    stop: Arc<AtomicBool>,
+    stopping: bool,
+    /// Something has happened that may be of interest for how the gateway is.
+    stirred: Arc<AtomicBool>,
+    /// The link was opened since somebody asked.
+    is_newly_open: bool,
+    /// Whoever waits for the end hears of it.
+    ended: SyncSender<()>,
+}
+
+impl BusRunner {
+    pub(super) fn new(
+        settings: Arc<Settings>,
+        index: usize,
+        clock: Clock,
+        state: Arc<StateFiles>,
+        publish: Box<dyn Fn(Message) + Send>,
+        ears: Ears,
+    ) -> BusRunner {
+        let bus = Bus::new(clock.now(), &settings, index, &state.memories());
+        let Ears { inbox, looks, bell, stop, stirred, ended } = ears;
+        BusRunner {
+            settings,
+            index,
+            clock,
+            state,
+            publish,
+            bus,
+            port: Port::Closed,
+            inbox,
+            looks,
+            bell,
+            stop,
+            stopping: false,
+            stirred,
+            is_newly_open: false,
+            ended,
+        }
+    }
+
+    pub(super) fn begin(&mut self) {
+        self.perform();
+    }
+
+    pub(super) fn is_finished(&self) -> bool {
+        self.bus.is_finished()
+    }
+
+    /// The last thing that is done with it.
+    pub(super) fn finish(self) {
+        // Perhaps nobody waits.
+        let _ = self.ended.try_send(());
+    }
+
+    pub(super) fn clock(&self) -> Clock {
+        self.clock
+    }
+
+    pub(super) fn bell(&self) -> &Bell {
+        &self.bell
+    }
+
+    pub(super) fn link(&self) -> Option<&GuardedLink> {
+        if let Port::Open(link) = &self.port { Some(link) } else { None }
+    }
+
+    pub(super) fn link_mut(&mut self) -> Option<&mut GuardedLink> {
+        if let Port::Open(link) = &mut self.port { Some(link) } else { None }
+    }
+
+    /// Whether this is another link than when this was last asked.
+    pub(super) fn take_newly_open(&mut self) -> bool {
+        std::mem::take(&mut self.is_newly_open)
+    }
+
+    /// When to go on although nothing came.
+    pub(super) fn wake_at(&self) -> Option<Time> {
+        let of_port = match &self.port {
+            Port::Closed | Port::Opening(_) => None,
+            Port::Waiting(open_at) => Some(*open_at),
+            Port::Open(link) => link.wake_at(),
+        };
+        of_port.into_iter().chain(self.bus.wake_at()).min()
+    }
+
+    /// Does what there is to do. `letters`: the bell has rung; `link`: there are bytes, or the link's time has
+    /// come.
+    pub(super) fn woken(&mut self, letters: bool, link: bool) {
+        if letters {
+            self.read_letters();
+            self.stop_if_asked();
+        }
+        // The bell rings also for a link that has opened.
+        if link || !matches!(self.port, Port::Open(_)) {
+            self.advance_port();
+        }
+        if self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
+            self.handle(Event::Wake);
+        }
+        self.perform();
+    }
+
+    fn handle(&mut self, event: Event) {
+        let now = self.clock.now();
+        self.bus.set_date(now, self.clock.today());
+        self.bus.handle(now, event);
+        self.perform();
+    }
+
+    fn perform(&mut self) {
+        while let Some(action) = self.bus.next_action() {
+            match action {
+                Action::Send { request, not_before, timeout } => {
+                    let begun = match &mut self.port {
+                        Port::Open(link) => link.begin(&request, not_before, timeout),
+                        _ => Err(Lost("the link is not open".into())),
+                    };
+                    self.line_said(begun);
+                }
+                Action::Withdraw => {
+                    if let Port::Open(link) = &mut self.port {
+                        if link.take_back() {
+                            self.bus.handle(self.clock.now(), Event::Withdrawn);
+                        }
+                    }
+                }
+                Action::Publish(message) => {
+                    // Of a device that is there its values are told, and nothing else.
+                    if message.topic.ends_with("/availability") || message.topic.ends_with("/info") {
+                        self.stir();
+                    }
+                    (self.publish)(message);
+                }
+                Action::Store(record) => self.state.store(record),
+                Action::Reopen { after } => {
+                    self.port = Port::Waiting(self.clock.now() + after);
+                    self.stir();
+                }
+                Action::Say(severity, text) => {
+                    match severity {
+                        Severity::Info => tracing::info!("{text}"),
+                        Severity::Warning => tracing::warn!("{text}"),
+                    }
+                    self.stir();
+                }
+            }
+        }
+    }
+
+    fn read_letters(&mut self) {
+        // At most as many as can wait, so that a flood does not keep the line waiting.
+        for _ in 0..Inbox::LIMIT {
+            let event = lock(&self.inbox).take();
+            let Some(event) = event else { break };
+            self.handle(event);
+        }
+        if !lock(&self.inbox).is_empty() {
+            self.bell.ring();
+        }
+        while let Ok(look) = self.looks.try_recv() {
+            look(&self.bus, self.clock.now());
+        }
+    }
+
+    fn stop_if_asked(&mut self) {
+        if self.stopping || !self.stop.load(Ordering::SeqCst) {
+            return;
+        }
+        self.stopping = true;
+        self.handle(Event::Shutdown);
+        if let Port::Open(link) = &mut self.port {
+            if let Some(reply) = link.withdraw("busker stops") {
+                self.handle(Event::Reply(reply));
+            }
+        }
+    }
+
+    fn advance_port(&mut self) {
+        match &mut self.port {
+            Port::Closed => {}
+            Port::Waiting(open_at) if self.clock.now() < *open_at => {}
+            Port::Waiting(_) => self.port = self.open(),
+            Port::Opening(opened) => match opened.try_recv() {
+                Ok(Ok(link)) => {
+                    let bus = &self.settings.buses[self.index];
+                    let guard = Guard::new(&bus.link, bus.gap);
+                    self.port = Port::Open(Box::new(GuardedLink::new(link, guard, self.clock)));
+                    self.is_newly_open = true;
+                    self.stir();
+                    self.handle(Event::LinkUp);
+                }
+                Ok(Err(lost)) => self.lose(lost),
+                Err(TryRecvError::Empty) => {}
+                Err(TryRecvError::Disconnected) => self.lose(Lost("it could not be opened".into())),
+            },
+            Port::Open(link) => {
+                let said = link.advance();
+                self.line_said(said);
+            }
+        }
+    }
+
+    fn stir(&self) {
+        self.stirred.store(true, Ordering::Relaxed);
+    }
+
+    fn open(&self) -> Port {
+        let (sender, receiver) = sync_channel(1);
+        let (settings, index, bell) = (self.settings.clone(), self.index, self.bell.clone());
+        let opener = std::thread::Builder::new().name("open".into()).spawn(move || {
+            // When the bus stops meanwhile, the link is closed again with the channel.
+            let _ = sender.send(Link::open(&settings.buses[index].link));
+            bell.ring();
+        });
+        if let Err(error) = opener {
+            tracing::error!("no thread can be started: {error}");
+        }
+        Port::Opening(receiver)
+    }
+
+    fn line_said(&mut self, said: Result<Option<Reply>, Lost>) {
+        match said {
+            Ok(Some(reply)) => self.handle(Event::Reply(reply)),
+            Ok(None) => {}
+            Err(lost) => self.lose(lost),
+        }
+    }
+
+    /// Closes the descriptor at once: as long as it is held, an adapter that comes back gets
+    /// another name.
+    pub(super) fn lose(&mut self, Lost(reason): Lost) {
+        self.port = Port::Closed;
+        self.stir();
+        self.handle(Event::LinkDown(reason));
+    }
+}
+
+impl Drop for BusRunner {
+    /// Also when it ends in a panic: what is sent to it now is refused, and not left to wait for ever.
+    fn drop(&mut self) {
+        lock(&self.inbox).close();
+    }
+}
+
+fn lock(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
+    // It is whole after every call, whoever panicked meanwhile.
+    inbox.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,194 @@
+//! Whose turn it is on the bus, and who may take it from whom.
+//!
+//! The order: the command that has begun, heartbeats and watchdogs that are late, waiting commands,
+//! heartbeats and watchdogs, what somebody asked for, settings that are not as they are wanted, a scan, then
+//! whichever device's read (or identification) is most urgent. Nobody who asks without end keeps a read that
+//! is due from the wire: [`AHEAD_OF_READS`].
+
+use crate::engine::modbus::{Call, Request};
+
+use super::device::{DeviceState, Polled};
+use super::{Action, Bus, InFlight, LinkState, OnBrokerLoss, Purpose};
+
+/// So many requests in a row may go before a read that is due, because somebody wants them at once. Then
+/// the read has its turn: under a flood of commands every period stretches, but nothing starves.
+const AHEAD_OF_READS: u32 = 8;
+
+impl Bus {
+    /// Asks what is to be asked next, if the line is free.
+    pub(super) fn ask_next(&mut self) {
+        if self.now < self.silent_until {
+            return;
+        }
+        while self.in_flight.is_none() && self.link_state == LinkState::Up {
+            if let Some((device, point, call)) = self.beat.take() {
+                self.send(device, call, Purpose::BeatWrite(point));
+                continue;
+            }
+            if self.begin_overdue_read()
+                || self.begin_beat(true)
+                || self.feed(true)
+                || self.begin_command()
+                || self.begin_beat(false)
+                || self.feed(false)
+                || self.next_fetch()
+                || self.begin_request()
+                || self.begin_setting()
+                || self.next_scan()
+            {
+                continue;
+            }
+            let now = self.now;
+            let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+            let urgent = candidates.filter_map(|(index, device)| {
+                device.most_urgent(now).map(|(polled, urgency)| (index, polled, urgency, device.served_at()))
+            });
+            // Of two equally urgent ones, that which has waited longest.
+            let next = urgent.reduce(|best, other| {
+                let better = other.2 > best.2 || (other.2 == best.2 && other.3 < best.3);
+                if better { other } else { best }
+            });
+            let read_before_setting = std::mem::take(&mut self.wrote_setting);
+            let read_before_request = self.requests_go_on();
+            let Some((device, polled, ..)) = next else {
+                // Nothing is due: the next setting, or question of a request, need not wait for it.
+                if read_before_setting || read_before_request {
+                    continue;
+                }
+                return;
+            };
+            self.poll(device, polled);
+        }
+    }
+
+    fn poll(&mut self, device: usize, polled: Polled) {
+        let (call, purpose) = match polled {
+            Polled::Identification(call) => (call, Purpose::Identify),
+            Polled::Read(read, call) => (call, Purpose::Poll { read }),
+        };
+        self.send(device, call, purpose);
+    }
+
+    /// A request has had its turn.
+    pub(super) fn count_turn(&mut self, ended: &InFlight) {
+        if ended.out_of_turn {
+            self.ahead += 1;
+        } else if matches!(ended.purpose, Purpose::Poll { .. }) {
+            self.ahead = 0;
+        }
+    }
+
+    /// A read that is due, after [`AHEAD_OF_READS`] requests that went before it.
+    fn begin_overdue_read(&mut self) -> bool {
+        if self.ahead < AHEAD_OF_READS {
+            return false;
+        }
+        self.ahead = 0;
+        let now = self.now;
+        let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+        let overdue = candidates.filter_map(|(index, device)| {
+            let (polled, waited) = device.longest_waiting(now)?;
+            Some((index, polled, waited))
+        });
+        let longest = overdue.reduce(|best, other| if other.2 > best.2 { other } else { best });
+        let Some((device, polled, _)) = longest else { return false };
+        self.poll(device, polled);
+        if let Some(in_flight) = &mut self.in_flight {
+            in_flight.out_of_turn = false;
+            in_flight.gives_way = false;
+        }
+        true
+    }
+
+    /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.
+    fn begin_beat(&mut self, late: bool) -> bool {
+        if !self.feeds {
+            return false;
+        }
+        let now = self.now;
+        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+        let due = devices.find_map(|(index, device)| Some((index, device.beat_due(now, late)?)));
+        let Some((device, point)) = due else { return false };
+        let call = Call::Read(self.devices[device].details(point).at.span);
+        self.send(device, call, Purpose::BeatRead(point));
+        true
+    }
+
+    /// Asks a device something whose watchdog wants to be fed. If it is `late`, no command goes before.
+    fn feed(&mut self, late: bool) -> bool {
+        if !self.feeds {
+            return false;
+        }
+        let now = self.now;
+        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
+        let due = devices.find_map(|(index, device)| Some((index, device.feed_due(now, late)?)));
+        let Some((device, read)) = due else { return false };
+        self.poll(device, self.devices[device].read_call(read));
+        if let Some(in_flight) = &mut self.in_flight {
+            in_flight.out_of_turn = true;
+            in_flight.gives_way &= !late;
+        }
+        true
+    }
+
+    /// Not a device that leaves. And one whose watchdog must run out is not spoken to while the broker is away.
+    pub(super) fn may_ask(&self, device: &DeviceState) -> bool {
+        let is_to_be_fed =
+            self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.wants_feeding();
+        is_to_be_fed && !device.is_leaving
+    }
+
+    /// What any device has.
+    pub(super) fn look_what_they_have(&mut self) {
+        self.feeds = self.devices.iter().any(DeviceState::wants_feeding);
+        self.has_settings = self.devices.iter().any(DeviceState::has_settings);
+    }
+
+    /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn.
+    pub(super) fn make_way(&mut self) {
+        let gives_way = |in_flight: &InFlight| in_flight.gives_way;
+        if self.in_flight.as_ref().is_some_and(gives_way) && self.command_can_begin() {
+            self.context.actions.push_back(Action::Withdraw);
+        }
+    }
+
+    pub(super) fn withdrawn(&mut self) {
+        let Some(in_flight) = self.in_flight.take() else { return };
+        if let (Purpose::Poll { read }, Some(device), Some(before)) =
+            (in_flight.purpose, in_flight.device, in_flight.before)
+        {
+            self.devices[device].take_back(read, before);
+        }
+    }
+
+    pub(super) fn send(&mut self, device: usize, call: Call, purpose: Purpose) {
+        let state = &mut self.devices[device];
+        let before = match purpose {
+            Purpose::Poll { read } => state.begin_read(read, self.now),
+            _ => state.turn(),
+        };
+        let is_poll = matches!(purpose, Purpose::Poll { .. });
+        let is_wish = matches!(purpose, Purpose::Command | Purpose::Fetch | Purpose::BeatRead(_));
+        let timeout = state.timeout(self.response_timeout);
+        let not_before = state.asked(self.now);
+        let request = state.request(call);
+        self.in_flight = Some(InFlight {
+            device: Some(device),
+            purpose,
+            sent_at: not_before,
+            out_of_turn: is_wish || (is_poll && before.was_wanted()),
+            before: Some(before),
+            gives_way: is_poll,
+        });
+        self.context.actions.push_back(Action::Send { request, not_before, timeout });
+    }
+
+    /// Asks a unit that is no device of this gateway.
+    pub(super) fn send_stranger(&mut self, request: Request, purpose: Purpose) {
+        let (now, timeout) = (self.now, self.response_timeout);
+        let (before, out_of_turn, gives_way) = (None, false, false);
+        self.in_flight =
+            Some(InFlight { device: None, purpose, sent_at: now, before, out_of_turn, gives_way });
+        self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
+    }
+}

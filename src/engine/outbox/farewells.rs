@@ -1,0 +1,127 @@
+//! What is announced no more is taken away from Home Assistant, also when another run announced it, or when
+//! nobody was there to hear.
+
+use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::topics::Message;
+
+use super::{Outbox, Queued};
+
+impl Outbox {
+    /// The broker remembers this announcement, perhaps of an earlier run. What it holds and we do not
+    /// have any more is taken away properly; announcements that are not ours are left alone.
+    pub fn found(&mut self, topic: &str, payload: &str) {
+        let Some(found) = Announcement::parse(&self.topics, topic, payload) else { return };
+        if self.retained.contains_key(topic) {
+            self.take_leave(found);
+        } else if self.own_devices.contains(topic) {
+            self.remembered.insert(topic.to_string(), found);
+        } else {
+            self.queue_last(Queued::Removal(topic.to_string()));
+            self.departed.insert(topic.to_string(), found);
+        }
+    }
+
+    /// Buries what `found` has and the present announcement on its topic has not.
+    pub(super) fn take_leave(&mut self, found: Announcement) {
+        let Some(entry) = self.retained.get(found.topic()) else { return };
+        let topic = found.topic();
+        let Some(present) = Announcement::parse(&self.topics, topic, &entry.payload) else { return };
+        if let Some(farewell) = homeassistant::farewell(&found, &present) {
+            let message = Message::retained(topic, entry.payload.clone());
+            // Home Assistant may have started since then, and buries only what it knows.
+            self.push_once(Message { retain: false, ..found.message() });
+            self.push_once(farewell);
+            self.push_retained(message);
+            self.departed.insert(found.topic().to_string(), found);
+        }
+    }
+
+    /// Takes away once more what was taken away while Home Assistant may not have listened: it keeps
+    /// entities over its own restart, and lets go only of what it has been told since.
+    pub(super) fn take_leave_again(&mut self) {
+        for (topic, found) in std::mem::take(&mut self.departed) {
+            if self.retained.contains_key(&*topic) {
+                self.take_leave(found);
+                self.departed.remove(&topic);
+            } else {
+                self.push_once(Message { retain: false, ..found.message() });
+                self.queue_last(Queued::Removal(topic));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{LATER, check_sent, outbox, retained, take_all};
+    use crate::engine::time::Time;
+
+    /// What this gateway announces of a device with these components.
+    fn announcement(keys: &[&str]) -> String {
+        let components: Vec<String> =
+            keys.iter().map(|key| format!("\"{key}\":{{\"platform\":\"sensor\"}}")).collect();
+        format!(
+            "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
+             \"components\":{{{}}}}}",
+            components.join(",")
+        )
+    }
+
+    #[test]
+    fn what_an_earlier_run_announced_and_is_gone_is_taken_away() {
+        let config = "homeassistant/device/busker_boiler/config";
+        let (old, new) = (announcement(&["flow", "level"]), announcement(&["level"]));
+        // `flow` stands there as a tombstone, behind what is left.
+        let farewell = announcement(&["level", "flow"]);
+        let expected =
+            [format!("{config} {old}!"), format!("{config} {farewell}!"), format!("{config} {new}")];
+        let expected: Vec<&str> = expected.iter().map(String::as_str).collect();
+
+        // Found before it is announced anew, and after.
+        let mut early = outbox();
+        early.found(config, &old);
+        check_sent(&mut early, &[]);
+        retained(&mut early, config, &new);
+        check_sent(&mut early, &expected);
+        let mut late = outbox();
+        retained(&mut late, config, &new);
+        assert!(late.next_message(LATER).is_some());
+        late.found(config, &old);
+        check_sent(&mut late, &expected);
+        late.found(config, &new);
+        check_sent(&mut late, &[]);
+
+        // A device that is no longer there goes whole, once; others' are left alone.
+        let mut outbox = outbox();
+        outbox.found("homeassistant/device/busker_gone/config", &old);
+        outbox.found("homeassistant/device/busker_2_gone/config", &old.replace("busker/", "busker_2/"));
+        outbox.found("homeassistant/device/stranger/config", "{}");
+        let removal = outbox.next_message(LATER).expect("the device is removed");
+        outbox.put_back(removal);
+        check_sent(&mut outbox, &["homeassistant/device/busker_gone/config "]);
+    }
+
+    #[test]
+    fn what_was_taken_away_while_home_assistant_was_not_there_is_taken_away_again_once() {
+        let config = "homeassistant/device/busker_boiler/config";
+        let gone = "homeassistant/device/busker_gone/config";
+        let (old, new) = (announcement(&["flow", "level"]), announcement(&["level"]));
+        let mut outbox = outbox();
+        retained(&mut outbox, config, &new);
+        outbox.found(config, &old);
+        outbox.found(gone, &old);
+        take_all(&mut outbox);
+        outbox.home_assistant_started(Time::from_millis(0));
+        let farewell = announcement(&["level", "flow"]);
+        let expected = [
+            format!("{config} {old}!"),
+            format!("{config} {farewell}!"),
+            format!("{config} {new}"),
+            format!("{gone} {old}!"),
+            format!("{gone} "),
+        ];
+        check_sent(&mut outbox, &expected.each_ref().map(String::as_str));
+        outbox.home_assistant_started(Time::from_millis(60_000));
+        check_sent(&mut outbox, &[&expected[2]]);
+    }
+}

@@ -1,0 +1,112 @@
+//! What a dead unit costs the others on its line, and how soon its return is noticed.
+
+use busker::engine::configuration;
+use busker::engine::profile::Library;
+use busker::engine::settings::Settings;
+use busker::engine::time::{Duration, Time};
+use busker::simulator::LineSettings;
+use busker::simulator::device::Place;
+use busker::simulator::line::Line;
+use busker::simulator::script::Action;
+
+use crate::device::{BLOCK, Diary, Timepiece};
+use crate::world::World;
+
+const UNITS: u8 = 10;
+const DEAD: u8 = UNITS;
+/// The pauses between probes have grown to their full length by then.
+const GROWN: Duration = Duration::from_secs(30);
+
+#[test]
+fn a_unit_that_died_costs_the_others_three_percent_at_most_and_is_back_within_two_seconds() {
+    check(Duration::from_secs(5), Duration::from_secs(2));
+}
+
+#[test]
+fn a_unit_that_never_answered_costs_no_more_and_is_back_within_fifteen_seconds() {
+    check(Duration::ZERO, Duration::from_secs(15));
+}
+
+/// The unit has been alive for so long, and its return is to be noticed within so long.
+#[track_caller]
+fn check(alive: Duration, noticed_within: Duration) {
+    let cost = live_cycle(&mut with_dead_unit(alive)) / live_cycle(&mut world(UNITS - 1)) - 1.0;
+    assert!(cost > 0.001 && cost <= 0.03, "{:.2} %", cost * 100.0);
+    let mut latest = Duration::ZERO;
+    for moment in 0..8 {
+        let mut world = with_dead_unit(alive);
+        world.run_until(world.now + noticed_within * moment / 8);
+        power(&mut world, true);
+        let returned_at = world.now;
+        world.run_until(returned_at + noticed_within + Duration::from_secs(1));
+        let requests = world.requests();
+        let asked = requests.iter().find(|(at, unit)| *unit == DEAD && *at >= returned_at);
+        latest = latest.max(asked.expect("it is asked again").0 - returned_at);
+        let topic = format!("busker/unit_{DEAD}/availability");
+        let last = world.published.iter().rev().find(|published| published.message.topic == topic);
+        assert_eq!(last.expect("it was told").message.payload, "online");
+    }
+    assert!(latest <= noticed_within, "{latest:?}");
+    assert!(latest >= noticed_within / 2, "the moments are not spread over a pause: {latest:?}");
+}
+
+/// The mean cycle of the others in seconds, over whole pauses of the dead unit.
+fn live_cycle(world: &mut World) -> f64 {
+    let from = world.now;
+    world.run_until(from + Duration::from_secs(240));
+    let requests = world.requests();
+    let requests: Vec<&(Time, u8)> = requests.iter().filter(|(at, _)| *at >= from).collect();
+    let probes: Vec<Time> = requests.iter().filter(|(_, unit)| *unit == DEAD).map(|(at, _)| *at).collect();
+    // An even number: long probes and short ones may take turns.
+    let (begin, end) = match probes.len() {
+        0 => (from, world.now),
+        count => (probes[0], probes[(count - 1) / 2 * 2]),
+    };
+    let live = requests.iter().filter(|(at, unit)| *unit != DEAD && (begin..end).contains(at)).count();
+    end.since(begin).as_secs_f64() / live as f64 * f64::from(UNITS - 1)
+}
+
+/// A line whose last unit is dead and has been asked in vain for long.
+fn with_dead_unit(alive: Duration) -> World {
+    let mut world = world(UNITS);
+    if alive.is_zero() {
+        power(&mut world, false);
+    }
+    world.run_until(world.now + alive);
+    power(&mut world, false);
+    world.run_until(world.now + GROWN);
+    world
+}
+
+fn power(world: &mut World, on: bool) {
+    world.act(DEAD, &Action::Power { unit: DEAD, on });
+}
+
+/// Units from 1 on, polled as fast as the line allows.
+fn world(units: u8) -> World {
+    let turnaround = Duration::from_millis(5);
+    let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
+    for unit in 1..=units {
+        let at = Place { unit, device: format!("unit_{unit}") };
+        line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
+    }
+    World::new(gateway(units), line)
+}
+
+fn gateway(units: u8) -> Settings {
+    let points: Vec<String> =
+        (0..BLOCK).map(|address| format!("reading_{address}: {{at: input {address}, poll: fast}}")).collect();
+    let mut text = String::from(
+        "buses: {line: {serial: /dev/ttyUSB0, baud: 19200, parity: even, response_timeout: 500ms}}\ndevices:\n",
+    );
+    for unit in 1..=units {
+        let points = points.join(", ");
+        text += &format!(
+            "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: 1ms}}, points: {{{points}}}}}\n"
+        );
+    }
+    match configuration::load("dead_unit.yaml", text.as_bytes(), &Library::shipped()) {
+        Ok((settings, _)) => settings,
+        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
+    }
+}
