@@ -46,7 +46,7 @@ pub struct App {
     pub(super) reporter: Arc<Reporter>,
     pub(super) state: Arc<StateFiles>,
     pub(super) threads: Threads,
-    watch: JoinHandle<()>,
+    pub(super) watch: JoinHandle<()>,
 }
 
 /// What the settings name and does not stand in them. It may change while they do not.
@@ -84,6 +84,7 @@ impl App {
             None => None,
         };
         let plant = Arc::new(Plant::new(settings, library, clock));
+        recall(&plant, &state);
         introduce(&plant.settings(), &plant.topics(), &plant.mailbox());
         let everyone = 0..plant.settings().buses.len();
         let threads = Threads::default();
@@ -96,7 +97,7 @@ impl App {
         let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched(&buses)));
         let http =
             listener.map(|listener| Http::serve(listener, reporter.clone(), clock, keys.token.clone()));
-        let watch = tokio::spawn(watch(reporter.clone(), plant.clone()));
+        let watch = tokio::spawn(watch(reporter.clone(), plant.clone(), state.clone()));
         Ok(App { runtime, clock, plant, broker: Some(broker), keys, http, reporter, state, threads, watch })
     }
 
@@ -136,11 +137,20 @@ impl App {
     }
 }
 
+/// What Home Assistant still has of an earlier run, whatever the broker has forgotten.
+fn recall(plant: &Plant, state: &StateFiles) {
+    if plant.settings().home_assistant.discovery {
+        plant.mailbox().change(|outbox| {
+            state.announced().iter().for_each(|(topic, payload)| outbox.recall(topic, payload));
+        });
+    }
+}
+
 /// What is known of the gateway before anything has happened.
 pub(super) fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
     mailbox.push(info(settings, topics));
     if settings.home_assistant.discovery {
-        let gateway = Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant);
+        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
         mailbox.push(homeassistant::announce_bridge(&gateway).message());
         for bus in &settings.buses {
             mailbox.push(homeassistant::announce_bus(&gateway, &bus.name).message());
@@ -231,7 +241,7 @@ pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
 
 /// Looks at the gateway again and again: tells its health, and feeds systemd's watchdog while every
 /// bus answers.
-async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
+pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc<StateFiles>) {
     let watchdog = shutdown::watchdog_interval().unwrap_or(ASK_EVERY);
     let every = watchdog.min(LOOK_EVERY);
     let rounds = |time: Duration| (time.as_millis() / every.as_millis().max(1)).max(1);
@@ -266,8 +276,11 @@ async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>) {
         if round % rounds_to_tell == 0 {
             for (bus, device) in report.devices() {
                 let health = device.health_json(&bus.name).to_string();
-                mailbox.push(Message::retained(topics.health(&device.name), health));
+                mailbox.push(Message::retained(topics.of_device(&bus.name, &device.name).health(), health));
             }
+        }
+        if report.broker.connected && plant.settings().home_assistant.discovery {
+            mailbox.look(|outbox| outbox.announced().iter().for_each(|told| state.store_announced(told)));
         }
         let info = plant.info(&report);
         if told_info != info {

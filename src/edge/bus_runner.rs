@@ -2,9 +2,9 @@
 //! the messages that it publishes. It waits for nothing; its thread does ([`crate::edge::bus_thread`]).
 
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use crate::edge::bell::Bell;
@@ -13,7 +13,7 @@ use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::{Link, Lost};
 use crate::edge::recordings;
 use crate::edge::state_files::StateFiles;
-use crate::engine::bus::{Action, Bus, Event, Severity};
+use crate::engine::bus::{Action, Bus, Event, Inbox, Severity};
 use crate::engine::health::BusReport;
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
@@ -23,23 +23,16 @@ use crate::engine::settings::Settings;
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
 
-/// Commands and questions that may wait for a bus. The thread takes all of them between two looks at the
-/// line, so this fills only when something floods it.
-pub(super) const WAITING_MAX: usize = 256;
-
-pub(super) enum Letter {
-    Event(Event),
-    Inspect(Look),
-}
+/// Looks that may wait for a bus.
+pub(super) const LOOKS_MAX: usize = 64;
 
 /// Something that looks at the bus on its thread.
 pub(super) type Look = Box<dyn FnOnce(&Bus, Time) + Send>;
 
 /// The near end of a handle's ways to its bus.
 pub(super) struct Ears {
-    pub(super) inbox: Receiver<Letter>,
-    /// For threads that the bus starts.
-    pub(super) to_itself: SyncSender<Letter>,
+    pub(super) inbox: Arc<Mutex<Inbox>>,
+    pub(super) looks: Receiver<Look>,
     pub(super) bell: Bell,
     pub(super) stop: Arc<AtomicBool>,
     pub(super) stirred: Arc<AtomicBool>,
@@ -70,8 +63,8 @@ pub(super) struct BusRunner {
     publish: Box<dyn Fn(Message) + Send>,
     bus: Bus,
     port: Port,
-    inbox: Receiver<Letter>,
-    to_itself: SyncSender<Letter>,
+    inbox: Arc<Mutex<Inbox>>,
+    looks: Receiver<Look>,
     saving: Saving,
     bell: Bell,
     stop: Arc<AtomicBool>,
@@ -94,7 +87,7 @@ impl BusRunner {
         ears: Ears,
     ) -> BusRunner {
         let bus = Bus::new(clock.now(), &settings, index, &state.memories());
-        let Ears { inbox, to_itself, bell, stop, stirred, ended } = ears;
+        let Ears { inbox, looks, bell, stop, stirred, ended } = ears;
         BusRunner {
             settings,
             index,
@@ -104,7 +97,7 @@ impl BusRunner {
             bus,
             port: Port::Closed,
             inbox,
-            to_itself,
+            looks,
             saving: Saving::new(),
             bell,
             stop,
@@ -128,9 +121,9 @@ impl BusRunner {
     }
 
     /// The last thing that is done with it.
-    pub(super) fn finish(self) {
+    pub(super) fn finish(mut self) {
         // Perhaps nobody waits.
-        let _ = self.ended.try_send(self.saving);
+        let _ = self.ended.try_send(std::mem::take(&mut self.saving));
     }
 
     pub(super) fn clock(&self) -> Clock {
@@ -182,7 +175,9 @@ impl BusRunner {
     }
 
     fn handle(&mut self, event: Event) {
-        self.bus.handle(self.clock.now(), event);
+        let now = self.clock.now();
+        self.bus.set_date(now, self.clock.today());
+        self.bus.handle(now, event);
         self.perform();
     }
 
@@ -229,14 +224,17 @@ impl BusRunner {
 
     fn read_letters(&mut self) {
         // At most as many as can wait, so that a flood does not keep the line waiting.
-        for _ in 0..WAITING_MAX {
-            match self.inbox.try_recv() {
-                Ok(Letter::Event(event)) => self.handle(event),
-                Ok(Letter::Inspect(look)) => look(&self.bus, self.clock.now()),
-                Err(TryRecvError::Empty | TryRecvError::Disconnected) => return,
-            }
+        for _ in 0..Inbox::LIMIT {
+            let event = lock(&self.inbox).take();
+            let Some(event) = event else { break };
+            self.handle(event);
         }
-        self.bell.ring();
+        if !lock(&self.inbox).is_empty() {
+            self.bell.ring();
+        }
+        while let Ok(look) = self.looks.try_recv() {
+            look(&self.bus, self.clock.now());
+        }
     }
 
     fn stop_if_asked(&mut self) {
@@ -298,7 +296,7 @@ impl BusRunner {
     /// Makes a file of a recording, on a thread of its own.
     fn record(&mut self, recording: Recording, request: Option<Request>) {
         self.saving.retain(|saving| !saving.is_finished());
-        let (to_itself, bell, clock) = (self.to_itself.clone(), self.bell.clone(), self.clock);
+        let (inbox, bell, clock) = (self.inbox.clone(), self.bell.clone(), self.clock);
         let (folder, keep) = (self.state.recordings().map(Path::to_path_buf), self.settings.recorder.keep);
         let saving = std::thread::Builder::new().name("recording".into()).spawn(move || {
             let result = match folder {
@@ -306,7 +304,7 @@ impl BusRunner {
                 None => Err("nothing is kept".into()),
             };
             // When the bus has ended, nobody asks any more.
-            let _ = to_itself.try_send(Letter::Event(Event::Recorded(request, result)));
+            let _ = lock(&inbox).push(Event::Recorded(request, result));
             bell.ring();
         });
         match saving {
@@ -330,4 +328,16 @@ impl BusRunner {
         self.stir();
         self.handle(Event::LinkDown(reason));
     }
+}
+
+impl Drop for BusRunner {
+    /// Also when it ends in a panic: what is sent to it now is refused, and not left to wait for ever.
+    fn drop(&mut self) {
+        lock(&self.inbox).close();
+    }
+}
+
+fn lock(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
+    // It is whole after every call, whoever panicked meanwhile.
+    inbox.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -15,13 +15,13 @@ use rustix::event::epoll;
 use tokio::sync::oneshot;
 
 use crate::edge::bell::Bell;
-use crate::edge::bus_runner::{BusRunner, Ears, Letter, Saving, WAITING_MAX};
+use crate::edge::bus_runner::{BusRunner, Ears, LOOKS_MAX, Look, Saving};
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::{Woken, wait};
 use crate::edge::link::{Lost, timespec};
 use crate::edge::punctual::Punctual;
 use crate::edge::state_files::StateFiles;
-use crate::engine::bus::{Bus, Event};
+use crate::engine::bus::{Bus, Command, Event, Full, Inbox};
 use crate::engine::health::BusReport;
 use crate::engine::settings::{Link, Settings};
 use crate::engine::time::Time;
@@ -29,7 +29,8 @@ use crate::engine::topics::Message;
 
 /// Talks to a bus's thread. Dropping it does not stop the thread.
 pub struct BusHandle {
-    letters: SyncSender<Letter>,
+    inbox: Arc<Mutex<Inbox>>,
+    looks: SyncSender<Look>,
     bell: Bell,
     stop: Arc<AtomicBool>,
     stirred: Arc<AtomicBool>,
@@ -37,14 +38,12 @@ pub struct BusHandle {
     ended: Mutex<Option<Receiver<Saving>>>,
 }
 
-/// Too much waits for the bus already; what was to be sent is dropped.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Full;
-
 impl BusHandle {
-    /// Hands an event to the bus.
-    pub fn send(&self, event: Event) -> Result<(), Full> {
-        self.post(Letter::Event(event))
+    /// Hands an event to the bus; returns the command whose place it took, if it did.
+    pub fn send(&self, event: Event) -> Result<Option<Command>, Full> {
+        let result = lock(&self.inbox).push(event);
+        self.bell.ring();
+        result
     }
 
     /// Runs `look` on the bus's thread, at once, even while a request is in flight. The receiver
@@ -59,7 +58,8 @@ impl BusHandle {
             let _ = sender.send(look(bus, now));
         };
         // What does not fit drops the sender, which the receiver notices.
-        let _ = self.post(Letter::Inspect(Box::new(look)));
+        let _ = self.looks.try_send(Box::new(look));
+        self.bell.ring();
         receiver
     }
 
@@ -87,12 +87,6 @@ impl BusHandle {
             Err(_) => tracing::error!("a bus ended in a panic"),
         }
     }
-
-    fn post(&self, letter: Letter) -> Result<(), Full> {
-        let result = self.letters.try_send(letter).map_err(|_| Full);
-        self.bell.ring();
-        result
-    }
 }
 
 /// The threads of a gateway's buses. After it is dropped each ends with its last bus.
@@ -111,7 +105,8 @@ impl Threads {
         state: Arc<StateFiles>,
         publish: Box<dyn Fn(Message) + Send>,
     ) -> std::io::Result<BusHandle> {
-        let (letters, inbox) = sync_channel(WAITING_MAX);
+        let inbox = Arc::<Mutex<Inbox>>::default();
+        let (looks, looks_in) = sync_channel(LOOKS_MAX);
         let (ended, end) = sync_channel(1);
         let stop = Arc::new(AtomicBool::new(false));
         let stirred = Arc::new(AtomicBool::new(true));
@@ -122,8 +117,8 @@ impl Threads {
             None => Bell::new()?,
         };
         let ears = Ears {
-            inbox,
-            to_itself: letters.clone(),
+            inbox: inbox.clone(),
+            looks: looks_in,
             bell: bell.clone(),
             stop: stop.clone(),
             stirred: stirred.clone(),
@@ -142,7 +137,7 @@ impl Threads {
                 std::thread::Builder::new().name(name).spawn(move || run_alone(runner))?;
             }
         }
-        Ok(BusHandle { letters, bell, stop, stirred, first, ended: Mutex::new(Some(end)) })
+        Ok(BusHandle { inbox, looks, bell, stop, stirred, first, ended: Mutex::new(Some(end)) })
     }
 
     /// The thread for connections, which begins with the first of them.

@@ -134,10 +134,12 @@ fn what_does_not_fit_into_the_inbox_is_refused_and_not_waited_for() {
     let bus = Threads::default()
         .start(settings("/dev/no-such", "1s"), 0, Clock::start(), nowhere(), Box::new(publish))
         .expect("a thread");
-    let taken = (0..=WAITING_MAX).filter(|_| bus.send(Event::BrokerUp).is_ok()).count();
-    assert_eq!(taken, WAITING_MAX);
+    let taken = (0..=Inbox::LIMIT).filter(|_| bus.send(Event::BrokerUp).is_ok()).count();
+    assert_eq!(taken, Inbox::LIMIT);
     assert_eq!(bus.send(Event::BrokerUp), Err(Full));
+    let looks: Vec<_> = (0..LOOKS_MAX).map(|_| bus.inspect(|_, _| ())).collect();
     assert!(bus.inspect(|_, _| ()).blocking_recv().is_err(), "a question is refused as well");
+    drop(looks);
     drop(held);
     bus.shutdown();
     bus.join();

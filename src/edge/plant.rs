@@ -6,14 +6,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::clock::Clock;
 use crate::edge::mqtt::{BrokerState, Mailbox, News};
-use crate::engine::bus::{Command, Event};
+use crate::engine::bus::{Command, Event, Full, REPLACED};
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::health::{BrokerReport, GatewayReport};
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::request::{Decision, Desk};
 use crate::engine::settings::Settings;
-use crate::engine::topics::{Message, Topics};
+use crate::engine::topics::{DeviceTopics, Message, Topics};
 
 /// The running parts.
 pub struct Plant {
@@ -35,9 +35,10 @@ struct Parts {
 
 impl Parts {
     fn new(settings: Settings, library: Library) -> Parts {
-        let topics = Topics::new(&settings.mqtt.base_topic);
+        let topics = Topics::of(&settings.mqtt);
         let outbox =
-            Outbox::new(topics.clone(), &settings.home_assistant.prefix, identities(&settings, &topics));
+            Outbox::new(topics.clone(), &settings.home_assistant.prefix, identities(&settings, &topics))
+                .with_values(settings.mqtt.values);
         Parts {
             desk: Desk::new(&settings, library),
             topics,
@@ -128,7 +129,8 @@ impl Plant {
             News::Up => parts.tell_all(&Event::BrokerUp),
             News::Down => parts.tell_all(&Event::BrokerDown),
             News::Get { device, point } => {
-                parts.tell_bus_of(&device.clone(), Event::Get { device, point });
+                // Who finds no room reads at the next poll.
+                let _ = parts.tell_bus_of(&device.clone(), Event::Get { device, point });
             }
             News::Request { verb, payload, retained, stale } => {
                 let decision = match stale {
@@ -138,12 +140,15 @@ impl Plant {
                 parts.carry_out(decision);
             }
             News::Set { device, point, payload, retained } => {
-                let refused = Outcome::new(OutcomeKind::Refused, &payload, "too many commands wait");
-                let topic = parts.topics.outcome(&device, &point);
                 let command = Command { device: device.clone(), point, payload, retained };
-                if !parts.tell_bus_of(&device, Event::Command(command)) {
-                    parts.mailbox.push(Message::once(topic, refused.to_json()));
-                }
+                let (command, outcome) = match parts.tell_bus_of(&device, Event::Command(command.clone())) {
+                    Ok(None) => return,
+                    Ok(Some(older)) => (older, (OutcomeKind::Expired, REPLACED)),
+                    Err(Full) => (command, (OutcomeKind::Refused, "too many commands wait")),
+                };
+                let outcome = Outcome::new(outcome.0, &command.payload, outcome.1);
+                let topic = parts.topics_of(&device).outcome(&command.point);
+                parts.mailbox.push(Message::once(topic, outcome.to_json()));
             }
         }
     }
@@ -176,13 +181,18 @@ impl Parts {
         }
     }
 
-    /// `false` if the bus has no room for it.
-    fn tell_bus_of(&self, device: &str, event: Event) -> bool {
+    fn topics_of(&self, device: &str) -> DeviceTopics {
+        let bus = self.bus_of.get(device).and_then(|bus| self.settings.buses.get(*bus));
+        self.topics.of_device(bus.map_or("", |bus| &bus.name), device)
+    }
+
+    /// Returns the command whose place the event took.
+    fn tell_bus_of(&self, device: &str, event: Event) -> Result<Option<Command>, Full> {
         match self.bus_of.get(device).map(|bus| self.buses.get(*bus)) {
-            Some(bus) => bus.is_some_and(|bus| bus.send(event).is_ok()),
+            Some(bus) => bus.map_or(Err(Full), |bus| bus.send(event)),
             None => {
                 tracing::debug!("a message for `{device}`, which is no device of this gateway");
-                true
+                Ok(None)
             }
         }
     }

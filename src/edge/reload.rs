@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::Context;
 
 use crate::edge::app::{
-    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, start_bus, start_buses, watched,
+    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, start_bus, start_buses, watch, watched,
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
@@ -40,12 +40,17 @@ impl App {
             Some(listen) if moves => Some(self.runtime.block_on(Http::bind(listen))?),
             Some(_) | None => None,
         };
+        let names = || settings.devices.iter().map(|device| device.name.as_str());
+        let state = match old.state_dir == settings.state_dir {
+            true => None,
+            false => Some(StateFiles::open(&settings.state_dir, names())?),
+        };
         let http_ends = old.http != settings.http || keys.token != self.keys.token;
         let listen = settings.http.listen.clone();
         match change {
             Change::Everything => {
                 tracing::info!("the new configuration changes what everything is made of: all begins anew");
-                self.begin_anew(&old, settings, library, keys, secrets)?;
+                self.begin_anew(state, settings, library, keys, secrets)?;
             }
             Change::Parts(parts) => {
                 if parts.is_nothing() && keys == self.keys {
@@ -74,7 +79,7 @@ impl App {
 
     fn begin_anew(
         &mut self,
-        old: &Settings,
+        state: Option<StateFiles>,
         settings: Settings,
         library: Library,
         keys: Keys,
@@ -86,12 +91,16 @@ impl App {
         if let Some(broker) = self.broker.take() {
             self.runtime.block_on(broker.finish());
         }
-        let names = || settings.devices.iter().map(|device| device.name.as_str());
-        if old.state_dir == settings.state_dir {
-            self.state.learn(names());
-        } else {
-            self.state.finish();
-            self.state = Arc::new(StateFiles::open(&settings.state_dir, names())?);
+        match state {
+            Some(state) => {
+                self.state.finish();
+                self.state = Arc::new(state);
+                self.watch.abort();
+                let _inside = self.runtime.enter();
+                let watch = watch(self.reporter.clone(), self.plant.clone(), self.state.clone());
+                self.watch = tokio::spawn(watch);
+            }
+            None => drop(self.state.learn(settings.devices.iter().map(|device| device.name.as_str()))),
         }
         let everyone = 0..settings.buses.len();
         self.plant.begin_anew(settings, library);
@@ -148,7 +157,7 @@ impl App {
                 _ => {
                     let mailbox = self.plant.mailbox();
                     if settings.home_assistant.discovery {
-                        let gateway = Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant);
+                        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
                         mailbox.push(homeassistant::announce_bus(&gateway, name).message());
                     }
                     let bus = start_bus(

@@ -10,13 +10,18 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
+use rustix::fs::FlockOperation;
+use rustix::io::Errno;
 
 use crate::engine::memory::{Memories, Memory, Record};
 use crate::engine::time::Duration;
 
 /// What could not be stored is tried again after this.
 const TRY_AGAIN_AFTER: Duration = Duration::from_secs(60);
+
+/// What Home Assistant has been told of this gateway, in `state_dir`.
+const ANNOUNCED: &str = "announced.json";
 
 /// What was remembered at the start, and where to put what is to be remembered.
 pub struct StateFiles {
@@ -29,6 +34,10 @@ pub struct StateFiles {
     desk: Arc<Desk>,
     thread: Mutex<Option<JoinHandle<()>>>,
     keeps: bool,
+    /// What Home Assistant was last told, by topic, as it is stored.
+    announced: Mutex<BTreeMap<String, String>>,
+    /// Held as long as this lives.
+    _lock: Option<File>,
 }
 
 /// What lies on it waits to be stored: the newest of each device.
@@ -41,16 +50,18 @@ struct Desk {
 #[derive(Default)]
 struct Waiting {
     memories: BTreeMap<String, Memory>,
+    announced: Option<String>,
     finish: bool,
 }
 
 impl StateFiles {
     /// Keeps nothing, and remembers nothing.
     pub fn nowhere() -> StateFiles {
-        StateFiles::unkept(Memories { unkept: Some("nothing is kept".into()), ..Memories::default() }, None)
+        let memories = Memories { unkept: Some("nothing is kept".into()), ..Memories::default() };
+        StateFiles::unkept(memories, None, None)
     }
 
-    fn unkept(memories: Memories, recordings: Option<PathBuf>) -> StateFiles {
+    fn unkept(memories: Memories, recordings: Option<PathBuf>, lock: Option<File>) -> StateFiles {
         StateFiles {
             damaged: Mutex::default(),
             memories: Mutex::new(memories),
@@ -59,13 +70,16 @@ impl StateFiles {
             desk: Arc::default(),
             thread: Mutex::default(),
             keeps: false,
+            announced: Mutex::default(),
+            _lock: lock,
         }
     }
 
     /// Reads what is remembered of these devices in `state_dir`. What is wrong with the files goes to
-    /// the log, and the gateway runs without them.
+    /// the log, and the gateway runs without them. An error means that another gateway has them.
     pub fn open<'d>(state_dir: &Path, devices: impl Iterator<Item = &'d str>) -> anyhow::Result<StateFiles> {
         let folder = state_dir.join("devices");
+        let lock = lock_folder(state_dir)?;
         let mut memories = Memories::default();
         let mut unknown = Vec::new();
         for device in devices {
@@ -89,7 +103,7 @@ impl StateFiles {
                  except where they are enforced"
             );
             // They may find room where a damaged memory must not be overwritten.
-            return Ok(StateFiles::unkept(memories, Some(state_dir.join("recordings"))));
+            return Ok(StateFiles::unkept(memories, Some(state_dir.join("recordings")), lock));
         }
         let desk = Arc::<Desk>::default();
         let (of_thread, of_files) = (desk.clone(), folder.clone());
@@ -105,6 +119,8 @@ impl StateFiles {
             desk,
             thread: Mutex::new(Some(thread)),
             keeps: true,
+            announced: Mutex::new(recall_announced(&state_dir.join(ANNOUNCED))),
+            _lock: lock,
         })
     }
 
@@ -149,6 +165,23 @@ impl StateFiles {
         }
     }
 
+    /// What an earlier run has told Home Assistant, by topic.
+    pub fn announced(&self) -> BTreeMap<String, String> {
+        lock(&self.announced).clone()
+    }
+
+    /// Keeps what Home Assistant has been told, if it is not what is kept. Does not wait for that.
+    pub fn store_announced(&self, told: &BTreeMap<&str, &str>) {
+        let mut announced = lock(&self.announced);
+        let as_stored = announced.iter().map(|(topic, payload)| (topic.as_str(), payload.as_str()));
+        if !self.keeps || as_stored.eq(told.iter().map(|(topic, payload)| (*topic, *payload))) {
+            return;
+        }
+        *announced = told.iter().map(|(topic, payload)| (topic.to_string(), payload.to_string())).collect();
+        self.desk.lock().announced = Some(serde_json::json!(*announced).to_string());
+        self.desk.changed.notify_all();
+    }
+
     /// Waits until everything is stored; the end.
     pub fn finish(&self) {
         self.desk.lock().finish = true;
@@ -174,7 +207,14 @@ impl Desk {
     fn work(&self, folder: &Path) {
         let mut failed = false;
         loop {
-            let (memories, finish) = self.take(failed);
+            let (memories, announced, finish) = self.take(failed);
+            if let Some(text) = announced {
+                let path = folder.with_file_name(ANNOUNCED);
+                if let Err(error) = replace(&path, &text) {
+                    // The broker most likely remembers it too.
+                    tracing::warn!("`{}` cannot be stored: {error}", path.display());
+                }
+            }
             for (device, memory) in memories {
                 match replace(&file_of(folder, &device), &memory.to_text()) {
                     Ok(()) if failed => {
@@ -203,17 +243,19 @@ impl Desk {
     }
 
     /// Waits for something to store, or for the end. After a failure, what waits may wait.
-    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, bool) {
+    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, Option<String>, bool) {
         let mut waiting = self.lock();
         if failed && !waiting.finish {
             let until_finish = |waiting: &mut Waiting| !waiting.finish;
             let waited = self.changed.wait_timeout_while(waiting, TRY_AGAIN_AFTER, until_finish);
             waiting = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
-        let nothing_to_do = |waiting: &mut Waiting| waiting.memories.is_empty() && !waiting.finish;
+        let nothing_to_do = |waiting: &mut Waiting| {
+            waiting.memories.is_empty() && waiting.announced.is_none() && !waiting.finish
+        };
         let mut waiting =
             self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
-        (std::mem::take(&mut waiting.memories), waiting.finish)
+        (std::mem::take(&mut waiting.memories), waiting.announced.take(), waiting.finish)
     }
 }
 
@@ -253,6 +295,19 @@ fn recall(path: &Path) -> Result<Option<Memory>, String> {
     }
 }
 
+/// What an earlier run has told Home Assistant; nothing if that is not known: the broker most likely does.
+fn recall_announced(path: &Path) -> BTreeMap<String, String> {
+    let read = match fs::read_to_string(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return BTreeMap::new(),
+        Err(error) => Err(error.to_string()),
+        Ok(text) => serde_json::from_str(&text).map_err(|error| error.to_string()),
+    };
+    read.unwrap_or_else(|reason| {
+        tracing::warn!("`{}` cannot be used ({reason}) and will be written anew", path.display());
+        BTreeMap::new()
+    })
+}
+
 /// Renames a damaged file to one with `.broken` behind its name, which replaces no other.
 fn keep_aside(path: &Path) -> io::Result<PathBuf> {
     let numbered = (2..=99).map(|number| format!(".broken.{number}"));
@@ -266,6 +321,38 @@ fn keep_aside(path: &Path) -> io::Result<PathBuf> {
         }
     }
     Err(io::Error::other("there are 99 damaged ones already"))
+}
+
+/// Two gateways with one folder would each count as if the other wrote nothing: the second one does not start.
+/// `None` where there can be no lock, since the folder cannot be written (which is told elsewhere) or its
+/// file system knows none.
+fn lock_folder(state_dir: &Path) -> anyhow::Result<Option<File>> {
+    let path = state_dir.join("lock");
+    let open = || File::options().read(true).write(true).create(true).truncate(false).open(&path);
+    let Ok(mut file) = fs::create_dir_all(state_dir).and_then(|()| open()) else { return Ok(None) };
+    let shown = state_dir.display();
+    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => {
+            // Only for who is refused; without it the lock holds all the same.
+            let told = file.set_len(0).and_then(|()| writeln!(file, "{}", std::process::id()));
+            if let Err(error) = told {
+                tracing::debug!("`{}` cannot be written: {error}", path.display());
+            }
+            Ok(Some(file))
+        }
+        Err(Errno::WOULDBLOCK) => {
+            let holder = fs::read_to_string(&path).unwrap_or_default();
+            let holder = holder.trim().parse::<u32>().map_or(String::new(), |id| format!(" (process {id})"));
+            bail!(
+                "another busker{holder} keeps its state in `{shown}`; end it, or give each a `state_dir` and a \
+                 `base_topic` of its own"
+            )
+        }
+        Err(error) => {
+            tracing::warn!("`{shown}` cannot be locked ({error}); see to it that no other busker uses it");
+            Ok(None)
+        }
+    }
 }
 
 /// Whether files can be made in `folder`, which is made if it is not there.
@@ -323,6 +410,21 @@ mod tests {
     }
 
     #[test]
+    fn a_folder_is_used_by_one_gateway_at_a_time() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let open = || StateFiles::open(folder.path(), ["one"].into_iter());
+        let first = open().expect("it is free");
+        let refused = open().err().expect("it is taken").to_string();
+        let holder = format!("another busker (process {}) keeps its state in `", std::process::id());
+        assert!(refused.starts_with(&holder), "{refused}");
+        drop(first);
+        drop(open().expect("it is free again"));
+        // What a process that was killed has left there holds nothing.
+        fs::write(folder.path().join("lock"), "123456").expect("a file");
+        drop(open().expect("it is free"));
+    }
+
+    #[test]
     fn a_device_that_comes_later_goes_on_from_what_is_remembered_of_it_now() {
         let folder = tempfile::tempdir().expect("a folder");
         let files = StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
@@ -345,6 +447,26 @@ mod tests {
         files.store(Record { device: "four".into(), memory: memory(1) });
         drop(files);
         assert!(devices.join("four.json").is_dir(), "it is not overwritten");
+    }
+
+    #[test]
+    fn what_was_announced_is_there_after_a_restart() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let open = || StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
+        let path = folder.path().join(ANNOUNCED);
+        let files = open();
+        assert_eq!(files.announced(), BTreeMap::new());
+        files.store_announced(&BTreeMap::from([("a/config", "{}")]));
+        drop(files);
+        let files = open();
+        assert_eq!(files.announced(), BTreeMap::from([("a/config".to_string(), "{}".to_string())]));
+        // What is the same is not written again: it may lie on a memory card.
+        fs::remove_file(&path).expect("it is there");
+        files.store_announced(&BTreeMap::from([("a/config", "{}")]));
+        drop(files);
+        assert!(!path.exists());
+        fs::write(&path, "{\"a/config\": 7").expect("a file");
+        assert_eq!(open().announced(), BTreeMap::new(), "a damaged one is as none");
     }
 
     #[test]

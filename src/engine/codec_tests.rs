@@ -128,6 +128,9 @@ fn a_wish_is_checked_rounded_and_encoded() {
     check_write(seconds.clone(), watchdog.clone(), "30", Ok("0BB8"));
     check_write(seconds.clone(), watchdog.clone(), "21.0", Ok("0834"));
     check_write(seconds.clone(), watchdog.clone(), "1e-05", Ok("0000"));
+    check_write(seconds.clone(), watchdog.clone(), " 2.1E+1\n", Ok("0834"));
+    check_write(seconds.clone(), watchdog.clone(), "655.354", Err("`655.354` is outside 0 to 655.35"));
+    check_write(seconds.clone(), watchdog.clone(), "21.005", Ok("0835"));
     check_write(seconds.clone(), watchdog.clone(), "655.36", Err("`655.36` is outside 0 to 655.35"));
     check_write(seconds.clone(), watchdog.clone(), "-1", Err("`-1` is outside 0 to 655.35"));
     check_write(seconds.clone(), watchdog.clone(), "1,5", Err("`1,5` is not a number"));

@@ -129,7 +129,8 @@ impl CommandFlow {
             Err(missing) => return refuse(missing.to_string()),
         };
         let flow = |state| CommandFlow { point, wanted: wanted.to_string(), state };
-        let reads_before = details.persistent || write.at.bits.is_some() || write.on_change.is_some();
+        let compares = details.persistent && !is_press(write);
+        let reads_before = compares || write.at.bits.is_some() || write.on_change.is_some();
         if !reads_before {
             let call = write_call(write, &field);
             return (Some(flow(State::Writing { field })), Step::Ask(call));
@@ -213,7 +214,8 @@ impl CommandFlow {
         let Some(held) = codec::words_at(write.at, write.at.span.first(), &words) else {
             return self.finish(OutcomeKind::NoReply, None, Some("the read before was too short".into()));
         };
-        if details.persistent && held == field {
+        // A button does something by being pressed, whatever its place holds.
+        if details.persistent && !is_press(write) && held == field {
             let found = tell(device, self.point, known, &held);
             return self.finish(OutcomeKind::Unchanged, found, None);
         }

@@ -13,9 +13,6 @@ use crate::engine::value::Decimal;
 /// Index into [`Device::points`].
 pub type PointIndex = usize;
 
-/// Topics that every device has beside those of its points, which are therefore called otherwise.
-pub const TOPICS_OF_EVERY_DEVICE: [&str; 3] = ["availability", "info", "health"];
-
 /// One type of device, or one device with its owner's wishes applied.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Device {

@@ -3,6 +3,7 @@
 //! the connection breaks; this does not.
 
 mod farewells;
+mod manner;
 mod pace;
 mod queue;
 mod reconfigure;
@@ -11,8 +12,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use crate::engine::homeassistant::Announcement;
+use crate::engine::settings::Manner;
 use crate::engine::time::{Duration, Time};
-use crate::engine::topics::{self, Message, OFFLINE, ONLINE, Topics};
+use crate::engine::topics::{self, Kind, Message, OFFLINE, ONLINE, Topics};
 
 use pace::Pace;
 use queue::{Lane, Queue, Queued};
@@ -25,6 +27,8 @@ const STATES_AFTER_DISCOVERY: Duration = Duration::from_millis(1500);
 #[derive(Clone, Debug)]
 pub struct Outbox {
     topics: Topics,
+    /// How values are told.
+    values: Manner,
     /// Topics that begin so are discovery.
     discovery_prefix: String,
     /// The discovery topics of all that this gateway has, announced already or not.
@@ -48,6 +52,8 @@ struct Retained {
     payload: String,
     queued: bool,
     number: u64,
+    /// The broker may keep a value of an earlier run, which nobody would replace.
+    kept: bool,
 }
 
 impl Outbox {
@@ -61,6 +67,7 @@ impl Outbox {
         let own = identities.into_iter().map(|identity| topics::discovery(discovery_prefix, &identity));
         Outbox {
             topics,
+            values: Manner::default(),
             discovery_prefix: format!("{discovery_prefix}/device/"),
             own_devices: own.collect(),
             remembered: BTreeMap::new(),
@@ -106,6 +113,10 @@ impl Outbox {
                 Queued::Removal(topic) => return Some(Message::retained(topic, "")),
                 Queued::Newest(topic) => {
                     if let Some(entry) = self.retained.get_mut(&topic) {
+                        if std::mem::take(&mut entry.kept) {
+                            self.queue.push_front(Lane::Others, Queued::Newest(topic.clone()));
+                            return Some(Message::retained(&*topic, ""));
+                        }
                         entry.queued = false;
                         return Some(Message::retained(&*topic, entry.payload.clone()));
                     }
@@ -121,6 +132,7 @@ impl Outbox {
         if !message.retain {
             self.queue.push_front(lane, Queued::Once(Box::new(message)));
         } else if let Some(entry) = self.retained.get_mut(&*message.topic) {
+            entry.kept |= message.payload.is_empty();
             // A newer value that came meanwhile stands in the queue already.
             if !std::mem::replace(&mut entry.queued, true) {
                 self.queue.push_front(lane, Queued::Newest(message.topic.into()));
@@ -133,6 +145,11 @@ impl Outbox {
     /// Messages told once, in their order, that were handed over and did not arrive: they are next
     /// again, as far as there is room.
     pub fn give_back(&mut self, messages: Vec<Message>) {
+        // A value that is not retained waits already.
+        let is_value = |message: &Message| {
+            self.topics.kind(&message.topic) == Kind::Value && self.retained.contains_key(&*message.topic)
+        };
+        let messages: Vec<Message> = messages.into_iter().filter(|message| !is_value(message)).collect();
         for message in messages.into_iter().rev() {
             if self.queue.is_full() {
                 self.dropped += 1;
@@ -218,7 +235,8 @@ impl Outbox {
             }
         } else {
             let topic: Arc<str> = message.topic.as_str().into();
-            let entry = Retained { payload: message.payload, queued: true, number: self.next_number };
+            let kept = !self.values.retain && self.topics.kind(&topic) == Kind::Value;
+            let entry = Retained { payload: message.payload, queued: true, number: self.next_number, kept };
             self.next_number += 1;
             self.retained.insert(topic.clone(), entry);
             self.queue_last(Queued::Newest(topic));
@@ -279,13 +297,12 @@ impl Outbox {
         if topic.starts_with(&self.discovery_prefix) {
             return Rank::Discovery;
         }
-        let below = topic.strip_prefix(self.topics.base()).unwrap_or(topic);
-        match below.trim_start_matches('/').split_once('/') {
-            Some(("bridge", "state")) => Rank::BridgeState,
-            Some(("bridge", _)) => Rank::Bridge,
-            Some((_, "availability")) => Rank::Availability,
-            Some((_, "info" | "health")) => Rank::Info,
-            _ => Rank::State,
+        match self.topics.kind(topic) {
+            Kind::BridgeState => Rank::BridgeState,
+            Kind::Bridge => Rank::Bridge,
+            Kind::Availability => Rank::Availability,
+            Kind::Info => Rank::Info,
+            Kind::Value | Kind::Other => Rank::State,
         }
     }
 }

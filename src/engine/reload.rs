@@ -48,8 +48,9 @@ impl Parts {
 /// Compares two configurations.
 pub fn compare(old: &Settings, new: &Settings) -> Change {
     let concerns_all = |settings: &Settings| {
-        let topics = (settings.mqtt.base_topic.clone(), settings.home_assistant.clone());
-        (topics, settings.state_dir.clone())
+        let mqtt = &settings.mqtt;
+        let topics = (mqtt.base_topic.clone(), mqtt.topics.clone(), mqtt.values.retain, mqtt.json);
+        (topics, settings.home_assistant.clone(), settings.state_dir.clone())
     };
     if concerns_all(old) != concerns_all(new) {
         return Change::Everything;
@@ -98,13 +99,17 @@ pub fn changed_devices(old: &Settings, new: &Settings) -> BTreeSet<String> {
 
 /// Every retained topic that the devices of these settings tell something on.
 pub fn topics_of_devices(settings: &Settings) -> BTreeSet<String> {
-    let topics = Topics::new(&settings.mqtt.base_topic);
+    let topics = Topics::of(&settings.mqtt);
     let of_device = |device: &DeviceSettings| {
         let points = device.device.points.iter().map(|point| &point.name);
         let things = device.device.things.iter().map(|thing| &thing.name);
-        let states: Vec<String> = points.chain(things).map(|name| topics.state(&device.name, name)).collect();
-        let own = [topics.availability(&device.name), topics.info(&device.name), topics.health(&device.name)];
-        own.into_iter().chain(states)
+        let own = topics.of_device(&settings.buses[device.bus].name, &device.name);
+        let mut all: Vec<String> = points.chain(things).map(|name| own.state(name)).collect();
+        all.extend([own.availability(), own.info(), own.health()]);
+        if settings.mqtt.json {
+            all.push(own.json().to_string());
+        }
+        all
     };
     settings.devices.iter().flat_map(of_device).collect()
 }
@@ -186,7 +191,11 @@ devices:
         check(&[("\nmqtt:", "\neeprom: {daily: 7}\nmqtt:")], "a restarts, b restarts");
         check(&[("\nmqtt:", "\nrepublish: 5m\nmqtt:")], "a restarts, b restarts");
         check(&[("\nmqtt:", "\nrecorder: {kilobytes: 0}\nmqtt:")], "a restarts, b restarts");
-        check(&[("'mqtt://localhost'", "'mqtt://localhost', base_topic: house")], "everything");
+        for more in
+            ["base_topic: house", "topics: '{base}/{bus}/{device}/{point}'", "retain: false", "json: true"]
+        {
+            check(&[("'mqtt://localhost'", &format!("'mqtt://localhost', {more}"))], "everything");
+        }
         check(&[("\nmqtt:", "\nhome_assistant: {discovery: false}\nmqtt:")], "everything");
         check(&[("\nmqtt:", "\nstate_dir: /tmp\nmqtt:")], "everything");
     }

@@ -208,7 +208,7 @@ impl Desk {
         let bus_of = settings.devices.iter().map(|device| (device.name.clone(), device.bus));
         let buses = settings.buses.iter().map(|bus| (bus.name.clone(), matches!(bus.link, Link::Tcp { .. })));
         Desk {
-            topics: Topics::new(&settings.mqtt.base_topic),
+            topics: Topics::of(&settings.mqtt),
             bus_of: bus_of.collect(),
             buses: buses.collect(),
             library,

@@ -1,6 +1,8 @@
 //! What the owner wants: broker, buses, devices. Resolved and checked; the file's shape is
 //! `configuration::file`.
 
+mod mqtt;
+
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -9,6 +11,8 @@ use crate::engine::address::Span;
 use crate::engine::device::{Device, PointIndex};
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
+
+pub use self::mqtt::{ClientCertificate, Layout, Level, Manner, Mqtt, Tls};
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
@@ -42,44 +46,6 @@ impl Settings {
             }
         }
     }
-}
-
-#[derive(Clone, PartialEq, Eq)]
-pub struct Mqtt {
-    pub host: String,
-    pub port: u16,
-    /// Where MQTT travels in a websocket, the path of its URL.
-    pub websocket: Option<String>,
-    /// `None`: not encrypted.
-    pub tls: Option<Tls>,
-    /// After this time without a message the broker is asked for a sign of life; a second one without
-    /// an answer is the end of the connection.
-    pub keep_alive: Duration,
-    pub username: Option<String>,
-    pub password: Password,
-    /// One per gateway where several share a broker.
-    pub base_topic: String,
-}
-
-impl fmt::Debug for Mqtt {
-    /// Tells everything but the password.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Mqtt({}:{}, base topic {})", self.host, self.port, self.base_topic)
-    }
-}
-
-/// How the broker proves itself, and how we do; the edge reads the files.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Tls {
-    /// The only authorities that are trusted; `None`: those of the system.
-    pub ca_file: Option<PathBuf>,
-    pub client: Option<ClientCertificate>,
-}
-
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ClientCertificate {
-    pub cert_file: PathBuf,
-    pub key_file: PathBuf,
 }
 
 /// Where the broker's password, or HTTP's token, comes from; the edge reads the file.

@@ -99,6 +99,11 @@ impl Values {
         &self.values[point].reading
     }
 
+    /// What was last told of it.
+    pub fn told(&self, point: PointIndex) -> Option<&Reading> {
+        self.values[point].told.as_ref().map(|(reading, _)| reading)
+    }
+
     pub fn read_at(&self, point: PointIndex) -> Option<Time> {
         self.values[point].read_at
     }

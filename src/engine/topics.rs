@@ -1,9 +1,16 @@
 //! MQTT topic names, both ways, and the message that carries a payload to one.
 
+use crate::engine::settings::{Layout, Level, Mqtt};
+
 /// The payload of a `state` or `availability` topic while all is well.
 pub const ONLINE: &str = "online";
 /// The payload of a `state` or `availability` topic otherwise; also the last will.
 pub const OFFLINE: &str = "offline";
+
+/// What stands where points stand and is told of the device itself: no point's name.
+pub const AVAILABILITY: &str = "availability";
+pub const INFO: &str = "info";
+pub const HEALTH: &str = "health";
 
 /// One message for the broker.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -35,20 +42,51 @@ pub enum Incoming<'t> {
     Request { verb: &'t str },
 }
 
+/// What is told on a topic of this gateway.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    BridgeState,
+    /// Anything else below `bridge`.
+    Bridge,
+    Availability,
+    Info,
+    /// What a point or a thing says, or all of a device at once.
+    Value,
+    /// None of its device topics, as discovery is.
+    Other,
+}
+
 /// The topics of one gateway, all below its base topic.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Topics {
     base: String,
+    layout: Layout,
 }
 
 impl Topics {
-    /// `base` is the configured base topic, `busker` or `house/cellar`, without a slash at its end.
+    /// `base` is the configured base topic, `busker` or `house/cellar`, without a slash at its end; points
+    /// stand at `<base>/<device>/<point>`.
     pub fn new(base: &str) -> Topics {
-        Topics { base: base.to_string() }
+        Topics { base: base.to_string(), layout: Layout::default() }
     }
 
-    pub fn base(&self) -> &str {
-        &self.base
+    /// As the configuration wants them.
+    pub fn of(mqtt: &Mqtt) -> Topics {
+        Topics { base: mqtt.base_topic.clone(), layout: mqtt.topics.clone() }
+    }
+
+    /// The topics of one device, which is on the bus called `bus`.
+    pub fn of_device(&self, bus: &str, device: &str) -> DeviceTopics {
+        let mut own = self.base.clone();
+        for level in &self.layout.levels {
+            own.push('/');
+            own.push_str(match level {
+                Level::Device => device,
+                Level::Bus => bus,
+                Level::Fixed(text) => text,
+            });
+        }
+        DeviceTopics { own }
     }
 
     /// Retained; the last will.
@@ -66,41 +104,6 @@ impl Topics {
         format!("{}/bridge/health", self.base)
     }
 
-    /// Retained.
-    pub fn availability(&self, device: &str) -> String {
-        format!("{}/{device}/availability", self.base)
-    }
-
-    /// Retained.
-    pub fn info(&self, device: &str) -> String {
-        format!("{}/{device}/info", self.base)
-    }
-
-    /// How the device is on its wire; retained, told each minute.
-    pub fn health(&self, device: &str) -> String {
-        format!("{}/{device}/health", self.base)
-    }
-
-    /// Where a point's value stands; retained.
-    pub fn state(&self, device: &str, point: &str) -> String {
-        format!("{}/{device}/{point}", self.base)
-    }
-
-    /// Where a wanted value is published by others.
-    pub fn set(&self, device: &str, point: &str) -> String {
-        format!("{}/{device}/{point}/set", self.base)
-    }
-
-    /// Where others ask for a reading.
-    pub fn get(&self, device: &str, point: &str) -> String {
-        format!("{}/{device}/{point}/get", self.base)
-    }
-
-    /// How a command ended; not retained.
-    pub fn outcome(&self, device: &str, point: &str) -> String {
-        format!("{}/{device}/{point}/outcome", self.base)
-    }
-
     /// Where programs ask the gateway for something.
     pub fn request(&self, verb: &str) -> String {
         format!("{}/bridge/request/{verb}", self.base)
@@ -113,23 +116,67 @@ impl Topics {
 
     /// The filters to subscribe to, so that everything [`Topics::parse`] knows arrives.
     pub fn subscriptions(&self) -> Vec<String> {
-        ["+/+/set", "+/+/get", "bridge/request/+"]
-            .iter()
-            .map(|tail| format!("{}/{tail}", self.base))
-            .collect()
+        let mut own = self.base.clone();
+        for level in &self.layout.levels {
+            own.push('/');
+            own.push_str(if let Level::Fixed(text) = level { text } else { "+" });
+        }
+        vec![format!("{own}/+/set"), format!("{own}/+/get"), format!("{}/bridge/request/+", self.base)]
     }
 
     /// What a message on `topic` asks for; `None` if it is none of our business.
     pub fn parse<'t>(&self, topic: &'t str) -> Option<Incoming<'t>> {
-        let below = topic.strip_prefix(self.base.as_str())?.strip_prefix('/')?;
-        let levels: Vec<&str> = below.split('/').collect();
+        let levels = self.below(topic)?;
         match levels[..] {
-            ["bridge", "request", verb] if !verb.is_empty() => Some(Incoming::Request { verb }),
-            ["bridge", ..] => None,
-            [device, point, "set"] => Some(Incoming::Set { device, point }),
-            [device, point, "get"] => Some(Incoming::Get { device, point }),
+            ["bridge", "request", verb] if !verb.is_empty() => return Some(Incoming::Request { verb }),
+            ["bridge", ..] => return None,
+            _ => {}
+        }
+        let device = self.device(&levels)?;
+        match levels[self.layout.levels.len()..] {
+            [point, "set"] => Some(Incoming::Set { device, point }),
+            [point, "get"] => Some(Incoming::Get { device, point }),
             _ => None,
         }
+    }
+
+    /// What is told on `topic`.
+    pub fn kind(&self, topic: &str) -> Kind {
+        let Some(levels) = self.below(topic) else { return Kind::Other };
+        match levels[..] {
+            ["bridge", "state"] => return Kind::BridgeState,
+            ["bridge", ..] => return Kind::Bridge,
+            _ => {}
+        }
+        if self.device(&levels).is_none() {
+            return Kind::Other;
+        }
+        match levels[self.layout.levels.len()..] {
+            [AVAILABILITY] => Kind::Availability,
+            [INFO | HEALTH] => Kind::Info,
+            [] | [_] => Kind::Value,
+            _ => Kind::Other,
+        }
+    }
+
+    fn below<'t>(&self, topic: &'t str) -> Option<Vec<&'t str>> {
+        let below = topic.strip_prefix(self.base.as_str())?.strip_prefix('/')?;
+        Some(below.split('/').collect())
+    }
+
+    /// The device that these levels below the base name, if they are laid out as ours.
+    fn device<'t>(&self, levels: &[&'t str]) -> Option<&'t str> {
+        let mut found = None;
+        for (index, wanted) in self.layout.levels.iter().enumerate() {
+            let level = *levels.get(index)?;
+            match wanted {
+                Level::Device => found = Some(level),
+                Level::Bus => {}
+                Level::Fixed(text) if text == level => {}
+                Level::Fixed(_) => return None,
+            }
+        }
+        found
     }
 
     /// The device's identity in Home Assistant, `busker_heating_relays`: its discovery topic, its
@@ -156,14 +203,71 @@ impl Topics {
     }
 }
 
+/// The topics of one device: `busker/heating_relays` and below.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DeviceTopics {
+    own: String,
+}
+
+impl DeviceTopics {
+    /// All that the device says in one message, where that is wanted; retained.
+    pub fn json(&self) -> &str {
+        &self.own
+    }
+
+    /// How the device is on its wire; retained, told each minute.
+    pub fn health(&self) -> String {
+        self.state(HEALTH)
+    }
+
+    /// Retained.
+    pub fn availability(&self) -> String {
+        self.state(AVAILABILITY)
+    }
+
+    /// Retained.
+    pub fn info(&self) -> String {
+        self.state(INFO)
+    }
+
+    /// Where a point's value stands; retained.
+    pub fn state(&self, point: &str) -> String {
+        format!("{}/{point}", self.own)
+    }
+
+    /// Where a wanted value is published by others.
+    pub fn set(&self, point: &str) -> String {
+        format!("{}/{point}/set", self.own)
+    }
+
+    /// Where others ask for a reading.
+    pub fn get(&self, point: &str) -> String {
+        format!("{}/{point}/get", self.own)
+    }
+
+    /// How a command ended; not retained.
+    pub fn outcome(&self, point: &str) -> String {
+        format!("{}/{point}/outcome", self.own)
+    }
+}
+
 /// Where Home Assistant looks for the device called `identity`: `homeassistant/device/<id>/config`.
 pub fn discovery(prefix: &str, identity: &str) -> String {
     format!("{prefix}/device/{identity}/config")
 }
 
+/// Where the outcome of a command on the topic `set` belongs.
+pub fn outcome_of(set: &str) -> String {
+    format!("{}/outcome", set.strip_suffix("/set").unwrap_or(set))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn laid_out(base: &str, pattern: &str) -> Topics {
+        Topics { base: base.into(), layout: Layout::parse(pattern).expect("a layout") }
+    }
 
     fn check_parse(base: &str, topic: &str, expected: Option<Incoming>) {
         assert_eq!(Topics::new(base).parse(topic), expected, "{topic}");
@@ -197,13 +301,62 @@ mod tests {
         }
     }
 
+    /// Topics in every layout are understood as they are told.
+    #[track_caller]
+    fn check_layout(pattern: &str, state: &str, filter: &str) {
+        let topics = laid_out("house/busker", pattern);
+        let device = topics.of_device("plant", "boiler");
+        assert_eq!(device.state("flow"), state);
+        assert_eq!(topics.subscriptions()[0], filter);
+        assert_eq!(outcome_of(&device.set("flow")), device.outcome("flow"));
+        assert_eq!(
+            topics.parse(&device.set("flow")),
+            Some(Incoming::Set { device: "boiler", point: "flow" })
+        );
+        assert_eq!(
+            topics.parse(&device.get("flow")),
+            Some(Incoming::Get { device: "boiler", point: "flow" })
+        );
+        for (topic, expected) in [
+            (device.state("flow"), Kind::Value),
+            (device.json().to_string(), Kind::Value),
+            (device.availability(), Kind::Availability),
+            (device.info(), Kind::Info),
+            (device.outcome("flow"), Kind::Other),
+            (topics.bridge_state(), Kind::BridgeState),
+            (topics.bridge_health(), Kind::Bridge),
+            ("homeassistant/device/busker_boiler/config".to_string(), Kind::Other),
+        ] {
+            assert_eq!(topics.kind(&topic), expected, "{topic}");
+            assert_eq!(topics.parse(&topic), None, "{topic}");
+        }
+    }
+
     #[test]
-    fn a_set_topic_is_understood_as_it_is_announced() {
+    fn every_layout_is_understood_as_it_is_told() {
+        check_layout("{base}/{device}/{point}", "house/busker/boiler/flow", "house/busker/+/+/set");
+        check_layout(
+            "{base}/{bus}/{device}/{point}",
+            "house/busker/plant/boiler/flow",
+            "house/busker/+/+/+/set",
+        );
+        check_layout(
+            "{base}/modbus/{device}/values/{point}",
+            "house/busker/modbus/boiler/values/flow",
+            "house/busker/modbus/+/values/+/set",
+        );
+        check_layout(
+            "{base}/{device}/{bus}/{point}",
+            "house/busker/boiler/plant/flow",
+            "house/busker/+/+/+/set",
+        );
+    }
+
+    #[test]
+    fn a_device_that_is_called_like_a_reserved_level_is_a_device() {
         let topics = Topics::new("busker");
-        let topic = topics.set("boiler", "flow");
-        assert_eq!(topics.parse(&topic), Some(Incoming::Set { device: "boiler", point: "flow" }));
-        let topic = topics.get("boiler", "flow");
-        assert_eq!(topics.parse(&topic), Some(Incoming::Get { device: "boiler", point: "flow" }));
+        assert_eq!(topics.kind(topics.of_device("line", "info").json()), Kind::Value);
+        assert_eq!(topics.kind(&topics.of_device("line", "set").state("get")), Kind::Value);
     }
 
     #[test]

@@ -210,6 +210,24 @@ impl fmt::Display for Missing {
     }
 }
 
+impl Reading {
+    /// As a JSON value: numbers with their digits, `"ON"` and `"OFF"`, names and texts, `null` where there is
+    /// none.
+    pub fn to_json(&self) -> String {
+        match self {
+            Reading::Number(_) | Reading::Float(_) => self.to_string(),
+            Reading::Flag(_) | Reading::Name(_) | Reading::Text(_) => {
+                serde_json::Value::from(self.to_string()).to_string()
+            }
+            Reading::List(readings) => {
+                let items: Vec<String> = readings.iter().map(Reading::to_json).collect();
+                format!("[{}]", items.join(","))
+            }
+            Reading::Missing(_) => "null".into(),
+        }
+    }
+}
+
 impl fmt::Display for Reading {
     /// The text published on MQTT: `21.5`, `ON`, `automatic`, `[0.1,null]`, `None`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -257,6 +275,27 @@ mod tests {
         }
         for text in ["", "-", ".", "1,5", "nan", "inf", "0x10", "1e", "1e99", "--1", "1 ", "٣"] {
             assert_eq!(Decimal::parse(text), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_reading_is_json_with_its_digits() {
+        let number = |text| Reading::Number(Decimal::parse(text).expect("a decimal"));
+        let list = Reading::List(vec![number("0.10"), Reading::Missing(Missing::NotANumber)]);
+        for (reading, expected) in [
+            (number("21.50"), "21.50"),
+            (number("-0.05"), "-0.05"),
+            (number("18446744073709551615"), "18446744073709551615"),
+            (Reading::Float(0.00001), "0.00001"),
+            (Reading::Float(20.0), "20"),
+            (Reading::Flag(true), "\"ON\""),
+            (Reading::Name("50 % \"A\"".into()), "\"50 % \\\"A\\\"\""),
+            (Reading::Text("21".into()), "\"21\""),
+            (list, "[0.10,null]"),
+            (Reading::Missing(Missing::Offline), "null"),
+        ] {
+            assert_eq!(reading.to_json(), expected);
+            assert!(serde_json::from_str::<serde_json::Value>(expected).is_ok(), "{expected}");
         }
     }
 

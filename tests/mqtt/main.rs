@@ -1,7 +1,10 @@
 //! The whole program between simulated devices and a real broker.
 
 mod faults;
+mod floods;
+mod manners;
 mod neighbours;
+mod orphans;
 mod proxy;
 mod reload;
 mod requests;

@@ -87,3 +87,39 @@ fn a_client_identifier_that_is_taken_is_told_once_and_the_pauses_grow() {
     let times = contested.log().iter().filter(|line| line.contains(said)).count();
     assert_eq!(times, 1, "{:?}", contested.log());
 }
+
+#[test]
+fn a_second_gateway_with_the_same_state_dir_does_not_start() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let gateway = Gateway::start(&broker, &configuration(&port));
+    let file = gateway.file().display().to_string();
+    let (code, told) = rig::busker(&["run", "--config", &file, "--http", "127.0.0.1:0"], &[]);
+    assert_eq!(code, Some(1), "{told}");
+    let expected = format!("another busker (process {}) keeps its state in `", gateway.id());
+    assert!(told.contains(&expected) && told.contains("a `state_dir`"), "{told}");
+
+    // Nor does a reload take what another one has.
+    let other = Gateway::start_with(&format!(
+        "mqtt: {{url: 'mqtt://127.0.0.1:{}', base_topic: other}}\n{}",
+        broker.port,
+        configuration(&port)
+    ));
+    let state = gateway.file().with_file_name("state");
+    let text = std::fs::read_to_string(other.file()).expect("its configuration");
+    let text: Vec<String> = text
+        .lines()
+        .map(|line| match line.starts_with("state_dir:") {
+            true => format!("state_dir: {}", state.display()),
+            false => line.to_string(),
+        })
+        .collect();
+    other.write_whole(&text.join("\n"));
+    other.reload("the new configuration is refused, and the old one goes on: another busker");
+    let told = rig::eventually(|| other.get("/health").1.contains("another busker").then_some(()));
+    assert!(told.is_some(), "{:?}", other.get("/health"));
+
+    // Killed, it leaves nothing behind that would keep the next one out.
+    gateway.kill();
+    other.reload("what has changed is at work");
+}

@@ -168,7 +168,18 @@ impl Gateway {
 
     /// The same with more variables in its environment.
     pub fn start_in(environment: &[(&str, &str)], rest: &str) -> Gateway {
-        let folder = tempfile::tempdir().expect("a folder");
+        Gateway::start_at(tempfile::tempdir().expect("a folder"), environment, rest)
+    }
+
+    /// Ends it, does something meanwhile, and starts it again where it was, with this configuration.
+    pub fn start_again(mut self, meanwhile: impl FnOnce(), rest: &str) -> Gateway {
+        let folder = std::mem::replace(&mut self.folder, tempfile::tempdir().expect("a folder"));
+        assert!(self.terminate().success());
+        meanwhile();
+        Gateway::start_at(folder, &[], rest)
+    }
+
+    fn start_at(folder: TempDir, environment: &[(&str, &str)], rest: &str) -> Gateway {
         let file = write_configuration(&folder, rest);
         let mut child = Command::new(env!("CARGO_BIN_EXE_busker"))
             .args(["run", "--config"])
@@ -253,6 +264,15 @@ impl Gateway {
     /// The end of [`Gateway::stall`].
     pub fn go_on(&self) {
         kill_process(Pid::from_child(&self.child), Signal::CONT).expect("the signal is sent");
+    }
+
+    /// Its configuration file, and what it runs as.
+    pub fn file(&self) -> PathBuf {
+        self.folder.path().join("busker.yaml")
+    }
+
+    pub fn id(&self) -> u32 {
+        self.child.id()
     }
 
     /// Puts another configuration in the place of its own, as for [`Gateway::start_with`].

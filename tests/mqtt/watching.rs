@@ -175,3 +175,26 @@ fn with_a_token_nothing_but_health_is_told_without_it() {
     assert!(watcher.received().iter().all(|got| !got.payload.contains(TOKEN)), "it is not published");
     assert!(gateway.log().iter().all(|line| !line.contains(TOKEN)), "it is not logged");
 }
+
+#[test]
+fn a_page_from_elsewhere_that_leads_a_browser_here_is_told_nothing() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start(&broker, &configuration(&port));
+    wait_until_all_is_online(&watcher);
+    let ask = |path: &str, host: &str| {
+        let request = agent().get(format!("{}{path}", gateway.http())).header("Host", host);
+        let mut answer = request.call().expect("HTTP answers");
+        let body = answer.body_mut().read_to_string().expect("text");
+        (answer.status().as_u16(), body)
+    };
+    for path in ["/", "/health", "/metrics", "/api/devices", "/api/buses", "/api/events", "/nothing"] {
+        let (status, body) = ask(path, "evil.example");
+        assert_eq!(status, 421, "{path}");
+        assert!(body.contains("token_file") && !body.contains("relay_1"), "{path}: {body}");
+    }
+    for host in ["localhost", "localhost:8485", "127.0.0.1:1", "[::1]:8485"] {
+        assert_eq!(ask("/api/devices", host).0, 200, "{host}");
+    }
+}

@@ -5,12 +5,15 @@
 mod support;
 
 use std::fs::{self, File};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
 use busker::engine::profile::Library;
 use busker::simulator::{DeviceAt, Framing, Model, Options, Simulation, TcpPort};
+use rustix::fs::{Mode, OFlags};
 use rustix::process::{Pid, Signal, kill_process};
+use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
 
 use support::{Mosquitto, Observer, free_port, program, wait_for};
@@ -103,6 +106,39 @@ fn what_is_dumped_from_one_device_makes_another_like_it() {
 
         let again = by_hand(&["settings", "apply", &file, "--yes"], &other, profile, unit);
         assert!(again.status.success() && text(&again.stdout).starts_with("nothing to change"), "{again:?}");
+    }
+}
+
+/// The near end of a terminal at which somebody has typed this, and its far end, which is to be kept.
+fn terminal(typed: &str) -> (File, File) {
+    let far = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
+    unlockpt(&far).expect("a pseudo-terminal");
+    let near = ptsname(&far, Vec::new()).expect("its name");
+    let near = rustix::fs::open(&near, OFlags::RDWR | OFlags::NOCTTY, Mode::empty()).expect("its near end");
+    let mut far = File::from(far);
+    far.write_all(typed.as_bytes()).expect("it is typed");
+    (File::from(near), far)
+}
+
+#[test]
+fn at_a_terminal_only_yes_writes() {
+    let folder = Folder::new();
+    let (_simulation, port) = fresh(RELAYS, 18);
+    let before = dump(&port, RELAYS, 18);
+    let file = folder.file("relays.yaml", "watchdog: 12.5s\n");
+    for (typed, writes) in [("no\n", false), ("\n", false), ("y\n", false), ("yes\n", true)] {
+        let (near, _far) = terminal(typed);
+        let output = Command::new(program())
+            .args(["settings", "apply", &file, "--tcp", &port.address().to_string()])
+            .args(["--unit", "18", "--profile", RELAYS])
+            .stdin(near)
+            .output()
+            .expect("the program is built");
+        let told = text(&output.stderr);
+        assert!(told.contains("Write this setting? Type yes: "), "{typed:?}: {told}");
+        assert_eq!(output.status.success(), writes, "{typed:?}: {told}");
+        assert_eq!(told.contains("nothing was written"), !writes, "{typed:?}: {told}");
+        assert_eq!(dump(&port, RELAYS, 18) == before, !writes, "{typed:?}: {told}");
     }
 }
 

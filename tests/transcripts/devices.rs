@@ -6,8 +6,8 @@ use busker::engine::device::{
 };
 use busker::engine::profile::Library;
 use busker::engine::settings::{
-    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password,
-    Recorder, Settings, Wanted,
+    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Layout, Line, Link, Manner, Mqtt, OnBrokerLoss, Parity,
+    Password, Recorder, Settings, Wanted,
 };
 use busker::engine::time::Duration;
 use busker::engine::units::Release;
@@ -16,7 +16,7 @@ use busker::engine::yaml::Scalar;
 
 /// Reads the header: `device …` lines, `setting DEVICE POINT VALUE` with `enforced` behind it perhaps,
 /// `raw-write DEVICE SPAN`,
-/// and `tcp`, `discovery`, `recorder` (which saves files on errors) or `stop feeding` by themselves.
+/// and `tcp`, `discovery`, `json`, `recorder` (which saves files on errors) or `stop feeding` by themselves.
 pub fn settings(header: &str) -> Settings {
     let mut devices = Vec::new();
     for line in header.lines() {
@@ -58,6 +58,9 @@ pub fn settings(header: &str) -> Settings {
             username: None,
             password: Password::None,
             base_topic: "busker".into(),
+            topics: Layout::default(),
+            values: Manner::default(),
+            json: says("json"),
         },
         home_assistant: HomeAssistant {
             discovery: says("discovery"),

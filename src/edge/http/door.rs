@@ -1,9 +1,10 @@
 //! What every answer has in common: who may have it, and what a browser may do with it.
 
+use std::net::{IpAddr, Ipv6Addr};
 use std::sync::Arc;
 
 use axum::extract::{Request, State};
-use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, Uri, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
@@ -12,12 +13,30 @@ use super::page;
 /// Whom to let in.
 pub struct Door {
     token: Option<String>,
+    /// Where only this machine is to read: the name under which it is asked, beside its addresses. A page
+    /// from anywhere can make a browser on this machine ask, under a name of the page's own that leads
+    /// here (DNS rebinding); nobody else has a reason to use another name.
+    own_name: Option<String>,
 }
 
 impl Door {
-    /// Without a token everybody is let in.
-    pub fn new(token: Option<String>) -> Door {
-        Door { token }
+    /// Without a token everybody is let in who can come; with `own_name` under this name or an address.
+    pub fn new(token: Option<String>, own_name: Option<String>) -> Door {
+        Door { own_name: own_name.filter(|_| token.is_none()), token }
+    }
+
+    /// Whether the question is meant for us, by the name that it was sent to.
+    fn is_meant(&self, uri: &Uri, headers: &HeaderMap) -> bool {
+        let Some(own_name) = &self.own_name else { return true };
+        let named = match uri.authority() {
+            Some(authority) => Some(authority.as_str()),
+            None => match headers.get(header::HOST) {
+                Some(host) => host.to_str().ok(),
+                // Before HTTP/1.1, and no browser.
+                None => return true,
+            },
+        };
+        named.is_some_and(|named| is_address_or(named, own_name))
     }
 
     fn lets_in(&self, path: &str, headers: &HeaderMap) -> bool {
@@ -29,13 +48,31 @@ impl Door {
 
 /// Around every request.
 pub async fn pass(State(door): State<Arc<Door>>, request: Request, next: Next) -> Response {
-    let mut response = if door.lets_in(request.uri().path(), request.headers()) {
+    let mut response = if !door.is_meant(request.uri(), request.headers()) {
+        (StatusCode::MISDIRECTED_REQUEST, NOT_MEANT).into_response()
+    } else if door.lets_in(request.uri().path(), request.headers()) {
         next.run(request).await
     } else {
         refuse(request.uri().path()).await
     };
     guard(response.headers_mut());
     response
+}
+
+const NOT_MEANT: &str = "\
+this gateway listens on this machine only, and answers to its addresses and to `localhost`, not to another \
+name; where a proxy or other machines read, configure a token (`http: {token_file: …}`)
+";
+
+/// Whether `host`, which may have a port, is `localhost`, `own_name` or an address.
+fn is_address_or(host: &str, own_name: &str) -> bool {
+    if let Some((inside, _)) = host.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        return inside.parse::<Ipv6Addr>().is_ok();
+    }
+    let name = host.split(':').next().unwrap_or_default();
+    let name = name.strip_suffix('.').unwrap_or(name);
+    let is_named = |own: &str| name.eq_ignore_ascii_case(own);
+    is_named("localhost") || is_named(own_name) || name.parse::<IpAddr>().is_ok()
 }
 
 /// The page tells nothing of the gateway by itself: it comes along, to ask for the token.
@@ -84,7 +121,7 @@ mod tests {
     use super::*;
 
     fn check(token: Option<&str>, path: &str, authorization: Option<&str>, expected: bool) {
-        let door = Door::new(token.map(str::to_string));
+        let door = Door::new(token.map(str::to_string), None);
         let mut headers = HeaderMap::new();
         if let Some(value) = authorization {
             headers.insert(header::AUTHORIZATION, value.parse().expect("a header"));
@@ -107,5 +144,56 @@ mod tests {
         {
             check(token, "/", Some(wrong), false);
         }
+    }
+
+    #[track_caller]
+    fn check_meant(door: &Door, uri: &str, host: Option<&str>, expected: bool) {
+        let mut headers = HeaderMap::new();
+        if let Some(host) = host {
+            headers.insert(header::HOST, host.parse().expect("a header"));
+        }
+        let uri: Uri = uri.parse().expect("a URI");
+        assert_eq!(door.is_meant(&uri, &headers), expected, "{uri} at {host:?}");
+    }
+
+    #[test]
+    fn on_this_machine_only_its_own_names_are_answered() {
+        let local = Door::new(None, Some("gateway.lan".into()));
+        for own in [
+            "localhost",
+            "localhost:8485",
+            "LOCALHOST.:8485",
+            "127.0.0.1:8485",
+            "127.8.8.8",
+            "[::1]",
+            "[::1]:8485",
+            "gateway.lan:8485",
+            "Gateway.LAN",
+        ] {
+            check_meant(&local, "/api/devices", Some(own), true);
+            check_meant(&local, &format!("http://{own}/api/devices"), Some("evil.example"), true);
+        }
+        for foreign in [
+            "evil.example",
+            "evil.example:8485",
+            "localhost.evil.example",
+            "127.0.0.1.evil.example",
+            "xgateway.lan",
+            "[evil.example]",
+            "[127.0.0.1",
+            "",
+        ] {
+            check_meant(&local, "/health", Some(foreign), false);
+        }
+        check_meant(&local, "http://evil.example/api/devices", Some("localhost"), false);
+        check_meant(&local, "/health", None, true);
+        // A stranger's page does not know the token, and where others read they have names of their own.
+        check_meant(
+            &Door::new(Some("s3cret".into()), Some("localhost".into())),
+            "/",
+            Some("gateway.lan"),
+            true,
+        );
+        check_meant(&Door::new(None, None), "/", Some("gateway.lan"), true);
     }
 }

@@ -31,6 +31,8 @@ use patience::PatientListener;
 pub struct Bound {
     listener: TcpListener,
     address: SocketAddr,
+    /// As it stands in the configuration.
+    host: String,
 }
 
 /// The running server.
@@ -45,12 +47,15 @@ impl Http {
         let listener =
             TcpListener::bind(listen).await.with_context(|| format!("HTTP cannot listen on {listen}"))?;
         let address = listener.local_addr().context("the HTTP listener has no address")?;
-        Ok(Bound { listener, address })
+        let host = listen.rsplit_once(':').map_or(listen, |(host, _)| host).to_string();
+        Ok(Bound { listener, address, host })
     }
 
     /// Answers from now on, to everything but `/health` only those who know the token. Only within a
     /// runtime.
     pub fn serve(bound: Bound, reporter: Arc<Reporter>, clock: Clock, token: Option<String>) -> Http {
+        // Whoever can reach an address of this machine alone is on it.
+        let own_name = bound.address.ip().is_loopback().then_some(bound.host);
         let hub = Arc::new(Hub::default());
         let telling = tokio::spawn(events::tell(hub.clone(), reporter.clone(), clock));
         let router = Router::new()
@@ -62,7 +67,7 @@ impl Http {
             .route("/api/buses/{bus}/frames.pcapng", get(frames))
             .route("/api/events", get(events))
             .with_state(Shared { reporter, clock, hub })
-            .layer(middleware::from_fn_with_state(Arc::new(Door::new(token)), door::pass));
+            .layer(middleware::from_fn_with_state(Arc::new(Door::new(token, own_name)), door::pass));
         let server = tokio::spawn(async move {
             if let Err(error) = axum::serve(PatientListener::new(bound.listener), router).await {
                 tracing::warn!("the HTTP server has ended: {error}");

@@ -45,13 +45,23 @@ impl Bus {
         let Some((device, target)) = self.find(&command.device, &command.point) else { return };
         if command.retained {
             if self.devices[device].warn_of_retained(target) {
-                let topic = self.context.gateway.topics.set(&command.device, &command.point);
+                let topic = self.context.topics_of(&command.device).set(&command.point);
                 self.context
                     .say(Severity::Warning, format!("a retained message on `{topic}` is ignored; delete it"));
             }
             return;
         }
         let is_press = self.devices[device].is_press(target);
+        if is_press {
+            if let Some(reason) = self.devices[device].is_too_soon(self.now, target) {
+                self.tell_outcome(
+                    device,
+                    target,
+                    Outcome::new(OutcomeKind::Refused, &command.payload, reason),
+                );
+                return;
+            }
+        }
         let waiting = Waiting::new(self.now, device, target, command.payload, is_press);
         for (replaced, reason) in self.waiting.push(waiting) {
             let outcome = Outcome::new(OutcomeKind::Expired, &replaced.wanted, reason);
@@ -294,7 +304,7 @@ impl Bus {
             return;
         }
         let state = &self.devices[device];
-        let topic = self.context.gateway.topics.outcome(state.name(), state.name_of(target));
+        let topic = self.context.topics_of(state.name()).outcome(state.name_of(target));
         self.context.publish(Message::once(topic, outcome.to_json()));
     }
 

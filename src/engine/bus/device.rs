@@ -10,6 +10,7 @@ mod requested;
 mod telling;
 mod turnaround;
 mod wear;
+mod whole;
 
 use std::collections::BTreeMap;
 
@@ -36,6 +37,7 @@ use keeping::Keeping;
 use patience::{FAILURES_UNTIL_OFFLINE, Patience};
 use turnaround::Turnaround;
 use wear::Wear;
+use whole::Whole;
 
 /// A device that is not the one that the profile describes is asked again after this.
 const PAUSE_MISMATCH: Duration = Duration::from_secs(30);
@@ -67,9 +69,12 @@ pub(super) struct DeviceState {
     counters: Counters,
     identity: Option<String>,
     told_available: Option<bool>,
+    /// Without dates.
     told_info: String,
+    told_info_at: Time,
     /// The last info said that the device is there.
     told_present: bool,
+    whole: Whole,
     announced: Option<Outline>,
     announcement_due: bool,
     /// A `get` or a command wants these told even if they have not changed.
@@ -140,7 +145,9 @@ impl DeviceState {
             identity: None,
             told_available: None,
             told_info: String::new(),
+            told_info_at: Time::default(),
             told_present: false,
+            whole: Whole::default(),
             announced: None,
             announcement_due: true,
             tell_anyway: Vec::new(),
@@ -318,7 +325,7 @@ impl DeviceState {
             self.announce(context);
         }
         self.tell_all(now, context);
-        self.tell_info(context);
+        self.tell_info(now, context);
     }
 
     /// The link is up: ask at once.
@@ -399,7 +406,7 @@ impl DeviceState {
         self.beats.stop();
         self.upkeep.forget();
         self.tell_all(now, context);
-        self.tell_info(context);
+        self.tell_info(now, context);
     }
 
     pub(super) fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
@@ -524,8 +531,9 @@ impl DeviceState {
             }
             self.publish_availability(true, context);
             let drift_changed = self.keep_settings(now, context);
-            if self.values.take_missing_changed() || !self.told_present || drift_changed {
-                self.tell_info(context);
+            let is_news = self.values.take_missing_changed() || !self.told_present || drift_changed;
+            if is_news || self.info_is_old(now, context) {
+                self.tell_info(now, context);
             }
         }
     }

@@ -5,8 +5,10 @@
 
 mod change;
 mod commands;
+mod context;
 mod device;
 mod fetch;
+mod inbox;
 mod load;
 mod pause;
 mod recording;
@@ -21,7 +23,6 @@ use crate::engine::address::Span;
 use crate::engine::command;
 use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
-use crate::engine::homeassistant::Gateway;
 use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::Tariff;
@@ -29,16 +30,19 @@ use crate::engine::recorder::Recording;
 use crate::engine::request;
 use crate::engine::schedule::Pace;
 use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settings};
-use crate::engine::time::{Duration, Time};
+use crate::engine::time::{Date, Duration, Time};
 use crate::engine::topics::Message;
 
 use commands::{Active, Settling};
+use context::Context;
 use device::{DeviceState, Turn};
 use fetch::Fetch;
+pub use inbox::{Full, Inbox};
 use recording::Recorder;
 pub use recording::Saved;
 use requests::Requests;
 use timekeeping::Timekeeping;
+pub use waiting::REPLACED;
 use waiting::{Target, WaitingCommands};
 
 /// After so many requests in a row that nobody answers, a TCP connection is made anew.
@@ -164,25 +168,6 @@ pub struct Bus {
     now: Time,
 }
 
-/// What everything on a bus shares: where messages go, and the actions that wait to be taken.
-struct Context {
-    actions: VecDeque<Action>,
-    gateway: Gateway,
-    discovery: bool,
-    bus_name: String,
-    republish: Duration,
-}
-
-impl Context {
-    fn publish(&mut self, message: Message) {
-        self.actions.push_back(Action::Publish(message));
-    }
-
-    fn say(&mut self, severity: Severity, text: String) {
-        self.actions.push_back(Action::Say(severity, text));
-    }
-}
-
 #[derive(Clone, Debug, PartialEq)]
 enum LinkState {
     Up,
@@ -238,13 +223,7 @@ impl Bus {
     /// of them.
     pub fn new(now: Time, settings: &Settings, index: usize, memories: &Memories) -> Bus {
         let bus = &settings.buses[index];
-        let mut context = Context {
-            actions: VecDeque::from([Action::Reopen { after: Duration::ZERO }]),
-            gateway: Gateway::new(&settings.mqtt.base_topic, &settings.home_assistant),
-            discovery: settings.home_assistant.discovery,
-            bus_name: bus.name.clone(),
-            republish: settings.republish,
-        };
+        let mut context = Context::new(settings, &bus.name);
         let tariff = Tariff::of(&bus.link, bus.gap);
         let of_bus = settings.devices.iter().filter(|device| device.bus == index);
         let mut devices: Vec<DeviceState> =
@@ -322,8 +301,16 @@ impl Bus {
             self.ask_next();
         }
         self.end_refreshes();
+        if self.context.json {
+            self.devices.iter_mut().for_each(|device| device.tell_whole(now, &mut self.context));
+        }
         self.remember();
         self.save_trouble();
+    }
+
+    /// Says what date it is, for texts: nothing is decided by it, and it may jump.
+    pub fn set_date(&mut self, now: Time, date: Date) {
+        self.context.date = Some((now, date));
     }
 
     /// Takes the next thing to do, until there is none.
@@ -334,7 +321,8 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let records = self.record_due_at.into_iter().chain(self.recorder.due_at());
+        let wholes = self.devices.iter().filter(|_| self.context.json).filter_map(DeviceState::whole_due_at);
+        let records = self.record_due_at.into_iter().chain(self.recorder.due_at()).chain(wholes);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
             return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
         }

@@ -3,6 +3,9 @@
 use crate::engine::device::PointIndex;
 use crate::engine::time::{Duration, Time};
 
+/// Why a command was not carried out.
+pub const REPLACED: &str = "a newer value took its place";
+
 /// What a command is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Target {
@@ -61,7 +64,7 @@ impl WaitingCommands {
         let mut displaced = Vec::new();
         let same = |other: &Waiting| other.device == command.device && other.target == command.target;
         if let Some(at) = self.queue.iter().position(same) {
-            displaced.push((std::mem::replace(&mut self.queue[at], command), "a newer value took its place"));
+            displaced.push((std::mem::replace(&mut self.queue[at], command), REPLACED));
             return displaced;
         }
         if self.queue.len() == WaitingCommands::LIMIT {

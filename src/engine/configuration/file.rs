@@ -8,11 +8,11 @@ use serde_json::json;
 
 use crate::engine::address::Span;
 use crate::engine::configuration::words::{
-    BaudRate, BrokerUrl, HostPort, Listen, Name, Part, StopBits, Token, Topic, Unit,
+    BaudRate, BrokerUrl, HostPort, Listen, Name, Part, Qos, StopBits, Token, Topic, Unit,
 };
 use crate::engine::device::Poll;
 use crate::engine::profile::file::{Intervals, Point, Presentation, Thing, Wire};
-use crate::engine::settings::{OnBrokerLoss, Parity};
+use crate::engine::settings::{Layout, OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
 use crate::engine::value::Decimal;
@@ -62,6 +62,18 @@ record! {
         password_file: Option<At<String>>,
         /// The first level of all topics; one per gateway where several share a broker.
         base_topic: At<Topic> = At::nowhere(Topic("busker".into())),
+        /// Where the values of devices stand: the levels `{base}`, `{bus}`, `{device}` and `{point}`, and
+        /// others as they are typed; `{base}` comes first and `{point}` last. `set`, `get` and `outcome` come
+        /// behind it, `availability` and `info` in the place of `{point}`.
+        topics: At<Layout> = At::nowhere(Layout::default()),
+        /// The quality of service with which values are told: 1, each is sent until the broker has confirmed
+        /// it, or 0, it is sent once.
+        qos: At<Qos> = At::nowhere(Qos(1)),
+        /// Whether the broker keeps the last value of each point for who comes later. Without, Home Assistant
+        /// knows none after its start until they are told again, which is some seconds later.
+        retain: bool = true,
+        /// Whether each device tells all its values in one JSON message too, on the topic above its points.
+        json: bool = false,
         /// Certificates, where the URL asks for TLS.
         tls: Option<Tls>,
         /// After this time without a message the broker is asked for a sign of life; after a second one

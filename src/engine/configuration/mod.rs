@@ -1,7 +1,9 @@
 //! A configuration file to [`Settings`], or to every fault in it.
 //!
-//! [`file`] is the shape, `words` its scalars; here, in `wishes` and in `wanted` are the rules beyond the shape.
+//! [`file`] is the shape, `words` its scalars; here, in `broker`, in `wishes` and in `wanted` are the rules beyond
+//! the shape.
 
+mod broker;
 pub mod file;
 mod secrets;
 mod wanted;
@@ -20,8 +22,8 @@ use crate::engine::device::Device;
 use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
-    Bus, ClientCertificate, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, Parity, Password,
-    Recorder, Settings, Tls, Wanted,
+    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Level, Line, Link, Parity, Password, Recorder,
+    Settings, Wanted,
 };
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
@@ -147,30 +149,6 @@ impl Resolver<'_> {
         })
     }
 
-    fn mqtt(&mut self, file: &file::Mqtt) -> Mqtt {
-        self.within(Some(&file.keep_alive), Duration::from_secs(1), Duration::from_secs(3600));
-        let (password, password_file) = (file.password.as_ref(), file.password_file.as_ref());
-        self.one_of_two("password", password.map(|at| &at.place), password_file.map(|at| &at.place));
-        let secret = file.password.as_ref().or(file.password_file.as_ref());
-        if let (Some(secret), None) = (secret, &file.username) {
-            self.faults.add(&secret.place, "a password without `username`; a broker wants both or neither");
-        }
-        Mqtt {
-            host: file.url.host.clone(),
-            port: file.url.port,
-            websocket: file.url.websocket.clone(),
-            tls: self.tls(file),
-            keep_alive: file.keep_alive.value,
-            username: file.username.as_ref().map(|username| username.value.clone()),
-            password: match (&file.password, &file.password_file) {
-                (Some(password), _) => Password::Given(password.value.clone()),
-                (None, Some(path)) => Password::File(PathBuf::from(&path.value)),
-                (None, None) => Password::None,
-            },
-            base_topic: file.base_topic.0.clone(),
-        }
-    }
-
     fn eeprom(&mut self, file: &file::Eeprom) -> Eeprom {
         self.within(Some(&file.interval), Duration::ZERO, Duration::from_secs(86_400));
         if file.daily.value == 0 {
@@ -201,36 +179,6 @@ impl Resolver<'_> {
         }
     }
 
-    fn tls(&mut self, file: &file::Mqtt) -> Option<Tls> {
-        let given = file.tls.as_ref();
-        if let Some(given) = given.filter(|_| !file.url.tls) {
-            let message = "certificates, and a `url` that does not ask for TLS; write `mqtts://` or `wss://` \
-                           there, or remove `tls`";
-            self.faults.add(&given.place, message);
-            return None;
-        }
-        if !file.url.tls {
-            return None;
-        }
-        let Some(given) = given else { return Some(Tls::default()) };
-        let path = |file: &At<String>| PathBuf::from(&file.value);
-        let client = match (&given.cert_file, &given.key_file) {
-            (Some(certificate), Some(key)) => {
-                Some(ClientCertificate { cert_file: path(certificate), key_file: path(key) })
-            }
-            (None, None) => None,
-            (Some(lonely), None) => {
-                self.faults.add(&lonely.place, "a certificate without its `key_file`");
-                None
-            }
-            (None, Some(lonely)) => {
-                self.faults.add(&lonely.place, "a key without its `cert_file`");
-                None
-            }
-        };
-        Some(Tls { ca_file: given.ca_file.as_ref().map(path), client })
-    }
-
     fn http(&mut self, file: &file::Http) -> Http {
         let (token, token_file) = (file.token.as_ref(), file.token_file.as_ref());
         self.one_of_two("token", token.map(|at| &at.place), token_file.map(|at| &at.place));
@@ -258,6 +206,7 @@ impl Resolver<'_> {
         let mut buses = Vec::new();
         let mut ports: Vec<&At<String>> = Vec::new();
         let devices = file.devices.get();
+        let first_level = section(&file.mqtt).and_then(|mqtt| mqtt.topics.levels.first().cloned());
         for (name, bus) in file.buses.get().into_iter().flat_map(Map::iter) {
             self.within(bus.response_timeout.get(), Duration::from_millis(10), Duration::from_secs(60));
             self.within(read_part(&bus.gap), Duration::from_micros(100), Duration::from_secs(1));
@@ -271,6 +220,11 @@ impl Resolver<'_> {
                 if !devices.iter().any(|(_, device)| is_here(device)) {
                     self.warnings.add(&name.place, format!("no device is on the bus `{}`", name.0));
                 }
+            }
+            if name.0 == "bridge" && first_level == Some(Level::Bus) {
+                let message = "below `{base}/bridge` the gateway tells of itself, and `topics` would put this bus \
+                               there; give the bus another name";
+                self.faults.add(&name.place, message);
             }
             if let Some(link) = self.link(name, bus) {
                 buses.push(Bus {

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::engine::codec;
 use crate::engine::device::Poll;
-use crate::engine::settings::OnBrokerLoss;
+use crate::engine::settings::{ClientCertificate, OnBrokerLoss, Tls};
 use crate::engine::value::Decimal;
 
 /// A device without cases and one that decides how its reading is understood.

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::engine::settings::{self, OnBrokerLoss, Parity};
+use crate::engine::settings::{self, Layout, OnBrokerLoss, Parity};
 use crate::engine::units::Release;
 use crate::engine::yaml::{Definitions, Faults, Json, Node, Read, Scalar, choices};
 
@@ -333,6 +333,44 @@ impl Scalar for Topic {
 
     fn schema() -> Json {
         json!({"type": "string", "pattern": "^[^$+#/\\s][^+#/\\s]*(/[^+#/\\s]+)*$"})
+    }
+}
+
+impl Scalar for Layout {
+    const EXPECTED: &'static str = "a layout like `\"{base}/{device}/{point}\"`";
+
+    fn parse(text: &str) -> Result<Layout, String> {
+        Layout::parse(text).map_err(|why| {
+            format!(
+                "`{text}` cannot be a layout of topics: {why}; expected one like `{{base}}/{{device}}/{{point}}` or \
+                 `{{base}}/{{bus}}/{{device}}/{{point}}`"
+            )
+        })
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": "^\\{base\\}/(([^{}+#/\\s]+|\\{(bus|device)\\})/)+\\{point\\}$"})
+    }
+}
+
+/// A quality of service.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Qos(pub u8);
+
+impl Scalar for Qos {
+    const EXPECTED: &'static str = "0 or 1";
+
+    fn parse(text: &str) -> Result<Qos, String> {
+        match text {
+            "0" => Ok(Qos(0)),
+            "1" => Ok(Qos(1)),
+            "2" => Err("2 would tell no value better: each replaces the one before; expected 0 or 1".into()),
+            _ => Err(format!("`{text}` is no quality of service; expected 0 or 1")),
+        }
+    }
+
+    fn schema() -> Json {
+        json!({"enum": [0, 1]})
     }
 }
 

@@ -11,7 +11,7 @@ use super::release;
 use super::thing::thing_component;
 use crate::engine::device::{Platform, Poll};
 use crate::engine::settings::{self, DeviceSettings};
-use crate::engine::topics::{self, Message, Topics};
+use crate::engine::topics::{self, DeviceTopics, Message, Topics};
 use crate::engine::units::Release;
 
 /// What all announcements of one gateway have in common.
@@ -25,9 +25,9 @@ pub struct Gateway {
 }
 
 impl Gateway {
-    pub fn new(base_topic: &str, home_assistant: &settings::HomeAssistant) -> Gateway {
+    pub fn new(mqtt: &settings::Mqtt, home_assistant: &settings::HomeAssistant) -> Gateway {
         Gateway {
-            topics: Topics::new(base_topic),
+            topics: Topics::of(mqtt),
             prefix: home_assistant.prefix.clone(),
             release: home_assistant.minimum_version,
         }
@@ -192,24 +192,25 @@ pub fn announcement(
     known: &[Option<i128>],
 ) -> Announcement {
     let topics = &gateway.topics;
+    let own = &topics.of_device(bus, &device.name);
     let identity = topics.identity(&device.name);
     let mut components = Components::new();
     for (index, point) in device.device.points.iter().enumerate() {
         let entities =
             entity(&device.device, index, known).into_iter().chain(companions(&device.device, index, known));
         for entity in entities {
-            components.push((entity.key.clone(), component(topics, device, &point.name, &entity)));
+            components.push((entity.key.clone(), component(&identity, own, device, &point.name, &entity)));
         }
     }
     if device.device.points.iter().any(|point| point.persistent) {
-        components.push((EEPROM_WRITES.into(), eeprom_writes(topics, device)));
+        components.push((EEPROM_WRITES.into(), eeprom_writes(&identity, own, device)));
     }
     for thing in &device.device.things {
-        if let Some(component) = thing_component(topics, device, thing, known) {
+        if let Some(component) = thing_component(&identity, own, device, thing, known) {
             components.push((thing.name.clone(), component));
         }
     }
-    components.extend(diagnostics(topics, device));
+    components.extend(diagnostics(&identity, own, device));
     let about = json!({
         "identifiers": [identity],
         "name": device.title,
@@ -217,15 +218,14 @@ pub fn announcement(
         "model": device.device.model,
         "via_device": topics.bus_identity(bus),
     });
-    let availability = [topics.bridge_state(), topics.availability(&device.name)];
+    let availability = [topics.bridge_state(), own.availability()];
     Announcement::new(gateway, &identity, without_empty(about), &availability, components)
 }
 
 /// How the device is on its wire.
-fn diagnostics(topics: &Topics, device: &DeviceSettings) -> Components {
-    let (identity, topic) = (topics.identity(&device.name), topics.health(&device.name));
-    let (entity, key, object) = (&device.name, "wire_", "value_json");
-    let place = Place { identity: &identity, entity, key, topic: &topic, object };
+fn diagnostics(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> Components {
+    let (topic, entity, key, object) = (own.health(), &device.name, "wire_", "value_json");
+    let place = Place { identity, entity, key, topic: &topic, object };
     let mut components = place.times(&["turnaround_p95"]);
     for (class, name) in [(Poll::Fast, "Fast period"), (Poll::Slow, "Slow period")] {
         if device.device.points.iter().any(|point| point.poll == class) {
@@ -239,13 +239,13 @@ fn diagnostics(topics: &Topics, device: &DeviceSettings) -> Components {
 /// The key of the entity that counts the writes to the device's EEPROM, and the info's too.
 const EEPROM_WRITES: &str = "eeprom_writes";
 
-fn eeprom_writes(topics: &Topics, device: &DeviceSettings) -> Map<String, Value> {
+fn eeprom_writes(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> Map<String, Value> {
     let component = json!({
         "platform": "sensor",
         "name": "EEPROM writes",
-        "unique_id": format!("{}_{EEPROM_WRITES}", topics.identity(&device.name)),
+        "unique_id": format!("{identity}_{EEPROM_WRITES}"),
         "default_entity_id": format!("sensor.{}_{EEPROM_WRITES}", device.name),
-        "state_topic": topics.info(&device.name),
+        "state_topic": own.info(),
         "value_template": format!("{{{{ value_json.{EEPROM_WRITES} }}}}"),
         "state_class": "total_increasing",
         "entity_category": "diagnostic",
@@ -254,11 +254,17 @@ fn eeprom_writes(topics: &Topics, device: &DeviceSettings) -> Map<String, Value>
     if let Value::Object(component) = component { component } else { Map::new() }
 }
 
-fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Entity) -> Map<String, Value> {
+fn component(
+    identity: &str,
+    own: &DeviceTopics,
+    device: &DeviceSettings,
+    point: &str,
+    entity: &Entity,
+) -> Map<String, Value> {
     let mut component = entity.component();
     component.insert("name".into(), name_beside(&entity.name, &device.title));
     let platform = entity.platform;
-    component.insert("unique_id".into(), format!("{}_{}", topics.identity(&device.name), entity.key).into());
+    component.insert("unique_id".into(), format!("{identity}_{}", entity.key).into());
     // With the case's unit: Home Assistant still has the entity of the case before when the new one
     // comes, and would end the id of the same name in `_2`.
     component.insert(
@@ -266,10 +272,10 @@ fn component(topics: &Topics, device: &DeviceSettings, point: &str, entity: &Ent
         format!("{}.{}_{}", platform.name(), device.name, entity.key).into(),
     );
     if platform != Platform::Button {
-        component.insert("state_topic".into(), topics.state(&device.name, point).into());
+        component.insert("state_topic".into(), own.state(point).into());
     }
     if !matches!(platform, Platform::Sensor | Platform::BinarySensor | Platform::Event) {
-        component.insert("command_topic".into(), topics.set(&device.name, point).into());
+        component.insert("command_topic".into(), own.set(point).into());
     }
     component
 }

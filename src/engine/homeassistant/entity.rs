@@ -4,7 +4,7 @@
 use serde_json::{Map, Number, Value, json};
 
 use super::thing;
-use crate::engine::codec::{self, Resolved};
+use crate::engine::codec::{self, Limits, Resolved};
 use crate::engine::device::{
     Category, Device, Encoding, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
 };
@@ -262,6 +262,7 @@ fn describe_number(entity: &mut Entity, point: &Point, resolved: &Resolved) {
     } else {
         let limits = point.write.as_ref().and_then(|write| codec::limits(resolved, &write.rule));
         if let Some(limits) = limits {
+            let limits = with_factory_setting(point, resolved, limits);
             (entity.min, entity.max, entity.step) = (Some(limits.min), Some(limits.max), limits.step);
             // Home Assistant logs an error for a number outside its limits and keeps the old one.
             if conditions.is_empty() {
@@ -273,6 +274,22 @@ fn describe_number(entity: &mut Entity, point: &Point, resolved: &Resolved) {
     entity.unit = unit;
     if !conditions.is_empty() {
         entity.value_template = Some(format!("{{{{ value if {} else None }}}}", conditions.join(" and ")));
+    }
+}
+
+/// The limits of a number in Home Assistant, which shows none outside of them. What the device holds as it left
+/// the factory is shown, also where the manual lets nobody write it; whoever tries is refused by the gateway.
+fn with_factory_setting(point: &Point, resolved: &Resolved, limits: Limits) -> Limits {
+    let form = resolved.form;
+    let is_number =
+        |raw: &i128| !form.names.list().iter().chain(&form.invalid).any(|(other, _)| other == raw);
+    let factory = point.default.filter(is_number).and_then(|raw| codec::to_unit(resolved, raw));
+    let Some(factory) = factory else { return limits };
+    let (min, max) = (limits.min, limits.max);
+    Limits {
+        min: if factory.compare(min).is_lt() { factory } else { min },
+        max: if factory.compare(max).is_gt() { factory } else { max },
+        ..limits
     }
 }
 

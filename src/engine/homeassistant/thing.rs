@@ -11,7 +11,7 @@ use super::entity::sentence;
 use crate::engine::codec;
 use crate::engine::device::{Device, PRESS, Point, PointIndex, Thing, ThingKind};
 use crate::engine::settings::DeviceSettings;
-use crate::engine::topics::Topics;
+use crate::engine::topics::DeviceTopics;
 use crate::engine::value::Decimal;
 
 /// A point as it is shown beside the things that live now.
@@ -67,7 +67,8 @@ pub fn name_of_thing(thing: &Thing) -> String {
 
 /// The discovery component of a thing; `None` while it does not live.
 pub(super) fn thing_component(
-    topics: &Topics,
+    identity: &str,
+    own: &DeviceTopics,
     device: &DeviceSettings,
     thing: &Thing,
     known: &[Option<i128>],
@@ -82,7 +83,7 @@ pub(super) fn thing_component(
     let mut put = |key: &str, value: Value| component.insert(key.into(), value);
     put("platform", platform.into());
     put("name", name_beside(&name, &device.title));
-    put("unique_id", format!("{}_{}", topics.identity(&device.name), thing.name).into());
+    put("unique_id", format!("{identity}_{}", thing.name).into());
     put("default_entity_id", format!("{platform}.{}_{}", device.name, thing.name).into());
     if let Some(class) = &presentation.device_class {
         put("device_class", class.clone().into());
@@ -96,7 +97,7 @@ pub(super) fn thing_component(
     if presentation.enabled == Some(false) {
         put("enabled_by_default", false.into());
     }
-    let (state, set) = (topics.state(&device.name, &thing.name), topics.set(&device.name, &thing.name));
+    let (state, set) = (own.state(&thing.name), own.set(&thing.name));
     match thing.kind {
         ThingKind::Button => {
             put("command_topic", set.into());
@@ -118,7 +119,7 @@ pub(super) fn thing_component(
             put("modes", modes.into());
             put("mode_state_topic", state.into());
             put("mode_command_topic", set.into());
-            let parts = climate_parts(topics, device, thing, known)?;
+            let parts = climate_parts(own, device, thing, known)?;
             parts.into_iter().for_each(|(key, value)| {
                 put(key, value);
             });
@@ -144,7 +145,7 @@ fn temperature_unit(device: &Device, thing: &Thing, known: &[Option<i128>]) -> O
 
 /// What a climate takes from its two temperatures.
 fn climate_parts(
-    topics: &Topics,
+    own: &DeviceTopics,
     device: &DeviceSettings,
     thing: &Thing,
     known: &[Option<i128>],
@@ -156,12 +157,12 @@ fn climate_parts(
     let rule = points[target].write.as_ref().map(|write| &write.rule);
     let limits = rule.and_then(|rule| codec::limits(&target_form, rule));
     let number = |decimal: Decimal| json!(decimal.to_f64());
-    let topic = |point: PointIndex| Value::from(topics.state(&device.name, &points[point].name));
+    let topic = |point: PointIndex| Value::from(own.state(&points[point].name));
     Some(vec![
         ("temperature_unit", unit.into()),
         ("current_temperature_topic", topic(present)),
         ("temperature_state_topic", topic(target)),
-        ("temperature_command_topic", topics.set(&device.name, &points[target].name).into()),
+        ("temperature_command_topic", own.set(&points[target].name).into()),
         // Home Assistant's own limits are those of a living room.
         ("min_temp", limits.map_or(json!(-50), |limits| number(limits.min))),
         ("max_temp", limits.map_or(json!(150), |limits| number(limits.max))),

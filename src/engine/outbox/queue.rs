@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use crate::engine::topics::Message;
 
-/// Messages told once that may wait; more push out the oldest.
-pub(super) const ONCE_MAX: usize = 256;
+/// Messages told once that may wait; more push out the oldest. A slider that is dragged has a thousand outcomes
+/// in a moment, and each of them is told.
+pub(super) const ONCE_MAX: usize = 2000;
 
 /// The empty queue keeps room for so many.
 const KEPT: usize = 1024;

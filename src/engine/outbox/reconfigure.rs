@@ -1,9 +1,9 @@
 //! What becomes of retained topics when the configuration changes while the gateway runs.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::engine::homeassistant::Announcement;
-use crate::engine::topics;
+use crate::engine::topics::{self, Message};
 
 use super::{Outbox, Queued, Rank};
 
@@ -45,6 +45,28 @@ impl Outbox {
         }
     }
 
+    /// What Home Assistant has been told of everything that this gateway has, by topic; `None` while it has not
+    /// been told all of it yet. Worth remembering: a broker may forget it, and Home Assistant does not.
+    pub fn announced(&self) -> Option<BTreeMap<&str, &str>> {
+        let is_told = self.queue.is_empty() && self.remembered.is_empty() && self.states_due_at.is_none();
+        let own = self.own_devices.iter();
+        let told = own.filter_map(|topic| {
+            let entry = self.retained.get(topic.as_str())?;
+            Some((topic.as_str(), entry.payload.as_str()))
+        });
+        is_told.then(|| told.collect())
+    }
+
+    /// What an earlier run has announced, and the broker may have forgotten. What is there no more is announced
+    /// once again and taken away then: Home Assistant lets go only of what it has been told since its start.
+    pub fn recall(&mut self, topic: &str, payload: &str) {
+        let is_gone = !self.own_devices.contains(topic);
+        if let Some(found) = Announcement::parse(&self.topics, topic, payload).filter(|_| is_gone) {
+            self.push_once(Message { retain: false, ..found.message() });
+        }
+        self.found(topic, payload);
+    }
+
     fn take_back_announcement(&mut self, topic: &str) {
         let found = self.retained.get(topic);
         let found = found.and_then(|entry| Announcement::parse(&self.topics, topic, &entry.payload));
@@ -65,7 +87,7 @@ impl Outbox {
 mod tests {
     use super::*;
     use crate::engine::time::Time;
-    use crate::engine::topics::{Message, Topics};
+    use crate::engine::topics::Topics;
 
     fn outbox() -> Outbox {
         let identities = ["busker_bridge", "busker_boiler", "busker_pump"].map(String::from);
@@ -133,5 +155,39 @@ mod tests {
         let sent = sent(&mut outbox);
         assert_eq!(sent.len(), 8, "{sent:?}");
         assert!(sent.iter().all(|sent| sent.ends_with(' ')), "{sent:?}");
+    }
+
+    #[test]
+    fn what_an_earlier_run_announced_is_taken_away_also_when_the_broker_has_forgotten_it() {
+        let announcement = |keys: &[&str]| {
+            let keys: Vec<String> =
+                keys.iter().map(|key| format!("\"{key}\":{{\"platform\":\"sensor\"}}")).collect();
+            format!(
+                "{{\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\"origin\":{{\"name\":\"busker\"}},\
+                 \"components\":{{{}}}}}",
+                keys.join(",")
+            )
+        };
+        let [boiler, pump] =
+            ["boiler", "pump"].map(|device| format!("homeassistant/device/busker_{device}/config"));
+        let mut outbox = Outbox::new(Topics::new("busker"), "homeassistant", ["busker_boiler".to_string()]);
+        outbox.recall(&boiler, &announcement(&["flow", "level"]));
+        outbox.recall(&pump, &announcement(&["speed"]));
+        outbox.recall("homeassistant/device/strange/config", "{}");
+        assert_eq!(outbox.announced(), None, "not all of it is told");
+        let present = announcement(&["level"]);
+        outbox.push(Message::retained(boiler.clone(), present.clone()));
+        outbox.connected();
+        let expected = [
+            format!("{boiler} {}", announcement(&["flow", "level"])),
+            format!("{boiler} {}", announcement(&["level", "flow"])),
+            format!("{boiler} {present}"),
+            format!("{pump} {}", announcement(&["speed"])),
+            format!("{pump} "),
+            "busker/bridge/state online".to_string(),
+        ];
+        assert_eq!(sent(&mut outbox), expected);
+        let told = outbox.announced().expect("all of it is told");
+        assert_eq!(told, BTreeMap::from([(boiler.as_str(), present.as_str())]));
     }
 }

@@ -21,7 +21,7 @@ pub fn things(page: &Page<'_>, text: &mut String) {
 
 /// The topic of a point or a thing of the device as the page configures it.
 fn topic(device: &Device, name: &str) -> String {
-    Topics::new("busker").state(&device_name(device), name)
+    Topics::new("busker").of_device("", &device_name(device)).state(name)
 }
 
 fn made_of_points(page: &Page<'_>, text: &mut String) {

@@ -103,6 +103,18 @@ impl DeviceState {
         }
     }
 
+    /// Why a button that wears out EEPROM is not pressed now. It does not wait as a value does: pressed a
+    /// minute late, it would surprise.
+    pub(in crate::engine::bus) fn is_too_soon(&self, now: Time, target: Target) -> Option<String> {
+        let allowed = self.writable_at(target);
+        (now < allowed).then(|| {
+            format!(
+                "its EEPROM has just been written (`eeprom: {{interval: …}}`); it may be pressed again in {} s",
+                (allowed - now).as_secs() + 1
+            )
+        })
+    }
+
     /// Why the point may not be written now, although its own time has come.
     pub(in crate::engine::bus) fn is_spent(&self, now: Time, point: PointIndex) -> Option<String> {
         if self.details(point).persistent { self.wear.spent(now) } else { None }
@@ -203,7 +215,7 @@ impl DeviceState {
         self.after_news(now, context);
         if self.details(point).persistent && self.is_present() {
             // How often the EEPROM has been written stands there.
-            self.tell_info(context);
+            self.tell_info(now, context);
         }
     }
 }

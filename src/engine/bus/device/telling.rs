@@ -29,7 +29,7 @@ impl DeviceState {
         if let Some(event) = &details.event {
             if self.values.take_flip(now, point) {
                 self.happened.insert(point, now);
-                let topic = context.gateway.topics.state(&self.settings.name, &details.name);
+                let topic = context.topics_of(&self.settings.name).state(&details.name);
                 context.publish(Message::once(topic, json!({"event_type": event}).to_string()));
             }
             return;
@@ -37,8 +37,9 @@ impl DeviceState {
         let anyway = self.tell_anyway.contains(&point);
         self.tell_anyway.retain(|other| *other != point);
         if let Some(text) = self.values.tell(now, point, details, context.republish, anyway) {
-            let topic = context.gateway.topics.state(&self.settings.name, &details.name);
+            let topic = context.topics_of(&self.settings.name).state(&details.name);
             context.publish(Message::retained(topic, text));
+            self.whole.has_changed();
         }
     }
 
@@ -53,8 +54,9 @@ impl DeviceState {
             let is_told = |(before, at): &(String, Time)| before == text && now - *at < context.republish;
             if !told.as_ref().is_some_and(is_told) {
                 *told = Some((text.to_string(), now));
-                let topic = context.gateway.topics.state(&self.settings.name, &thing.name);
+                let topic = context.topics_of(&self.settings.name).state(&thing.name);
                 context.publish(Message::retained(topic, text));
+                self.whole.has_changed();
             }
         }
     }
@@ -85,7 +87,7 @@ impl DeviceState {
             return;
         }
         self.told_available = Some(available);
-        let topic = context.gateway.topics.availability(&self.settings.name);
+        let topic = context.topics_of(&self.settings.name).availability();
         context.publish(Message::retained(topic, if available { ONLINE } else { OFFLINE }));
     }
 
@@ -120,7 +122,14 @@ impl DeviceState {
         homeassistant::announcement(&context.gateway, &self.settings, &context.bus_name, self.values.known())
     }
 
-    pub(super) fn tell_info(&mut self, context: &mut Context) {
+    /// Whether the info is as old as anything is told again.
+    pub(super) fn info_is_old(&self, now: Time, context: &Context) -> bool {
+        now - self.told_info_at >= context.republish
+    }
+
+    /// What is known of the device beside its values. When each of them was last read belongs to it, and is
+    /// no reason to tell it: so it is as of when this was told.
+    pub(super) fn tell_info(&mut self, now: Time, context: &mut Context) {
         let missing: serde_json::Map<String, serde_json::Value> = self
             .settings
             .device
@@ -137,7 +146,7 @@ impl DeviceState {
                 _ => None,
             })
             .collect();
-        let info = json!({
+        let mut info = json!({
             "profile": self.settings.device.profile,
             "manufacturer": self.settings.device.manufacturer,
             "model": self.settings.device.model,
@@ -149,13 +158,26 @@ impl DeviceState {
             "missing": missing,
             "eeprom_writes": self.counters.persistent_writes,
             "drift": drift_json(&self.upkeep.drift()),
-        })
-        .to_string();
+        });
         self.told_present = self.presence == Presence::Present;
-        if info != self.told_info {
-            let topic = context.gateway.topics.info(&self.settings.name);
-            context.publish(Message::retained(topic, info.clone()));
-            self.told_info = info;
+        let without_dates = info.to_string();
+        if without_dates == self.told_info && !self.info_is_old(now, context) {
+            return;
         }
+        (self.told_info, self.told_info_at) = (without_dates, now);
+        info["last_read"] = self.dates_of_readings(context);
+        context.publish(Message::retained(context.topics_of(&self.settings.name).info(), info.to_string()));
+    }
+
+    /// When each point was last read, also those that say nothing now.
+    fn dates_of_readings(&self, context: &Context) -> serde_json::Value {
+        let points = self.settings.device.points.iter().enumerate();
+        let dates = points.filter(|(_, point)| !point.is_button() && point.event.is_none()).filter_map(
+            |(index, point)| {
+                let date = context.date_of(self.values.read_at(index)?)?;
+                Some((point.name.clone(), serde_json::Value::from(date.to_string())))
+            },
+        );
+        serde_json::Value::Object(dates.collect())
     }
 }

@@ -10,7 +10,7 @@ mod presentation;
 mod things;
 mod writing;
 
-use crate::engine::device::{Device, Encoding, Form, Point, TOPICS_OF_EVERY_DEVICE};
+use crate::engine::device::{Device, Encoding, Form, Point};
 use crate::engine::profile::expand::Expanded;
 use crate::engine::profile::file::{self, Profile};
 use crate::engine::yaml::{At, Faults};
@@ -71,12 +71,9 @@ impl<'a, 'f> Rules<'a, 'f> {
                     ),
                 );
             }
-            if TOPICS_OF_EVERY_DEVICE.contains(&point.name.as_str()) {
+            if let Some(why) = taken_by_the_gateway(&point.name) {
                 let name = &point.name;
-                self.faults.add(
-                    point.place,
-                    format!("`{name}` is a topic of every device; expected another name for this point"),
-                );
+                self.faults.add(point.place, format!("`{name}` {why}; expected another name for this point"));
             }
         }
     }
@@ -141,4 +138,13 @@ fn raw_range(point: &Point, form: &Form) -> Option<(i128, i128)> {
 /// Whether the key is there and says `true`.
 fn is_true(key: &Option<At<bool>>) -> bool {
     key.as_ref().is_some_and(|key| key.value)
+}
+
+/// What a name stands for already, if it does: neither a point nor a thing can be called so.
+fn taken_by_the_gateway(name: &str) -> Option<&'static str> {
+    match name {
+        "availability" | "info" | "health" => Some("is a topic of every device"),
+        "eeprom_writes" => Some("is the entity that counts what is written to the device's EEPROM"),
+        _ => None,
+    }
 }

@@ -1,9 +1,7 @@
 //! Rules of things: they are made of points that say and can be told what their rows ask for.
 
-use crate::engine::device::{
-    Encoding, Kind, Names, Point, PointIndex, Poll, TOPICS_OF_EVERY_DEVICE, Thing, ThingKind, WriteRule,
-};
-use crate::engine::profile::check::Rules;
+use crate::engine::device::{Encoding, Kind, Names, Point, PointIndex, Poll, Thing, ThingKind, WriteRule};
+use crate::engine::profile::check::{Rules, taken_by_the_gateway};
 use crate::engine::profile::file;
 use crate::engine::profile::text::PointPath;
 use crate::engine::yaml::{At, Map, list_of_choices};
@@ -20,10 +18,10 @@ impl<'a, 'f> Rules<'a, 'f> {
         for (path, _) in self.profile.things.iter() {
             for thing in self.device.things.iter().filter(|thing| is_at(thing, &path.value)) {
                 let is_taken = self.device.points.iter().any(|point| point.name == thing.name);
-                if is_taken || TOPICS_OF_EVERY_DEVICE.contains(&thing.name.as_str()) {
-                    let message =
-                        format!("`{}` is a point's name or topic; expected another name", thing.name);
-                    self.faults.add(&path.place, message);
+                let why =
+                    if is_taken { Some("is a point's name") } else { taken_by_the_gateway(&thing.name) };
+                if let Some(why) = why {
+                    self.faults.add(&path.place, format!("`{}` {why}; expected another name", thing.name));
                 }
             }
         }

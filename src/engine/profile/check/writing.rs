@@ -51,12 +51,6 @@ impl Rules<'_, '_> {
                     "`write` of a button, which only has its one word; remove one of the two",
                 );
             }
-            if let Some(persistent) = &file.persistent {
-                self.faults.add(
-                    &persistent.place,
-                    "a button is pressed whenever it is asked for, and not kept in EEPROM; remove `persistent`",
-                );
-            }
             if let Some(values) = &file.form.values {
                 self.faults.add(&values.place, "`values` of a button, which is never read; remove them");
             }

@@ -1,0 +1,215 @@
+//! Feeds the client library from the mailbox, and hands on what comes in.
+
+use std::sync::{Arc, Mutex};
+
+use rumqttc::{AsyncClient, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
+use tokio::sync::{mpsc, oneshot};
+
+use super::lock;
+use super::mailbox::Mailbox;
+use super::poller::Seen;
+use crate::edge::clock::Clock;
+use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::health::BrokerReport;
+use crate::engine::settings::Manner;
+use crate::engine::time::Duration;
+use crate::engine::topics::{self, Incoming, Message, ONLINE, Topics};
+
+/// What the broker has to tell the rest of the program.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum News {
+    Up,
+    Down,
+    Set {
+        device: String,
+        point: String,
+        payload: String,
+        retained: bool,
+    },
+    Get {
+        device: String,
+        point: String,
+    },
+    /// `stale` says why it would be too old to be obeyed.
+    Request {
+        verb: String,
+        payload: String,
+        retained: bool,
+        stale: Option<String>,
+    },
+}
+/// Feeds the library from the outbox and hands on what comes in.
+pub(super) struct Feeder<Tell> {
+    pub client: AsyncClient,
+    pub clock: Clock,
+    pub topics: Topics,
+    pub status_topic: String,
+    pub filters: Vec<String>,
+    pub mailbox: Arc<Mailbox>,
+    pub state: Arc<Mutex<BrokerReport>>,
+    pub connected: bool,
+    /// Whether the last connection was lost to somebody else with our identifier.
+    pub contested: bool,
+    /// What was last told of the connection.
+    pub told_up: Option<bool>,
+    pub subscribed: bool,
+    pub tell: Tell,
+}
+
+impl<Tell: Fn(News)> Feeder<Tell> {
+    pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut goodbye: oneshot::Receiver<()>) {
+        let mut ending = false;
+        loop {
+            let wake_at = self.mailbox.outbox().wake_at();
+            let until = wake_at.map_or(Duration::from_secs(3600), |time| self.clock.until(time));
+            tokio::select! {
+                seen = events.recv() => match seen {
+                    Some(seen) => self.handle(seen),
+                    None => return,
+                },
+                () = self.mailbox.news.notified() => {}
+                () = tokio::time::sleep(until) => self.mailbox.outbox().wake(self.clock.now()),
+                _ = &mut goodbye, if !ending => {
+                    ending = true;
+                    self.mailbox.outbox().goodbye();
+                }
+            }
+            if ending && !self.connected {
+                return;
+            }
+            let all_sent = self.feed();
+            if ending && all_sent {
+                return self.disconnect(events).await;
+            }
+        }
+    }
+
+    fn handle(&mut self, seen: Seen) {
+        match seen {
+            Seen::Up => {
+                tracing::info!("connected to the broker");
+                let mut state = lock(&self.state);
+                state.connected = true;
+                state.reason = None;
+                state.connects += 1;
+                drop(state);
+                (self.connected, self.subscribed) = (true, false);
+                self.mailbox.outbox().connected();
+                self.told_up = Some(true);
+                (self.tell)(News::Up);
+            }
+            Seen::Down { reason, contested } => {
+                let mut state = lock(&self.state);
+                state.connected = false;
+                // Once for each reason, not once for each attempt; and a quarrel once, not each time
+                // that it is lost.
+                let is_known = state.reason.as_ref() == Some(&reason) || (contested && self.contested);
+                if !is_known {
+                    tracing::warn!("{reason}");
+                }
+                self.contested = contested;
+                state.reason = Some(reason);
+                drop(state);
+                self.connected = false;
+                if self.told_up != Some(false) {
+                    self.told_up = Some(false);
+                    (self.tell)(News::Down);
+                }
+            }
+            Seen::Unsent(messages) => self.mailbox.outbox().give_back(messages),
+            Seen::Packet { packet: Packet::Publish(publish), stale_for } => {
+                let payload = String::from_utf8_lossy(&publish.payload).into_owned();
+                // A broker repeats only what it has kept from an earlier connection.
+                let stale = match (publish.dup, stale_for) {
+                    (true, _) => Some("the broker has kept it from an earlier connection".to_string()),
+                    (false, Some(age)) => Some(format!(
+                        "the broker or the way to it was stalled; it may be {} s old",
+                        age.as_secs()
+                    )),
+                    (false, None) => None,
+                };
+                self.receive(&publish.topic, payload, publish.retain, stale);
+            }
+            Seen::Packet { packet: Packet::SubAck(answer), .. } => {
+                if answer.return_codes.contains(&SubscribeReasonCode::Failure) {
+                    tracing::warn!("the broker does not let this user subscribe; commands will not arrive");
+                }
+            }
+            Seen::Packet { .. } | Seen::Room => {}
+        }
+    }
+
+    /// `stale` says why a command would be too old to be obeyed.
+    fn receive(&self, topic: &str, payload: String, retained: bool, stale: Option<String>) {
+        if topic == self.status_topic {
+            // A retained birth message is old news: everything was sent when the connection was made.
+            if payload == ONLINE && !retained {
+                tracing::info!("Home Assistant has started: announcing all devices again");
+                self.mailbox.outbox().home_assistant_started(self.clock.now());
+            }
+            return;
+        }
+        if topic.ends_with("/config") {
+            if retained {
+                self.mailbox.outbox().found(topic, &payload);
+            }
+            return;
+        }
+        match self.topics.parse(topic) {
+            Some(Incoming::Set { .. }) if !retained && stale.is_some() => {
+                let reason = stale.unwrap_or_default();
+                tracing::warn!("`{topic}` is not obeyed: {reason}");
+                let outcome = Outcome::new(OutcomeKind::Expired, &payload, &reason);
+                let topic = topics::outcome_of(topic);
+                self.mailbox.outbox().push(Message::once(topic, outcome.to_json()));
+            }
+            Some(Incoming::Set { device, point }) => {
+                let (device, point) = (device.to_string(), point.to_string());
+                (self.tell)(News::Set { device, point, payload, retained });
+            }
+            Some(Incoming::Get { device, point }) if !retained => {
+                (self.tell)(News::Get { device: device.to_string(), point: point.to_string() });
+            }
+            Some(Incoming::Request { verb }) => {
+                (self.tell)(News::Request { verb: verb.to_string(), payload, retained, stale });
+            }
+            Some(Incoming::Get { .. }) | None => {}
+        }
+    }
+
+    /// Hands over as much as the library has room for; `true` if nothing is left.
+    fn feed(&mut self) -> bool {
+        if !self.connected {
+            return false;
+        }
+        if !self.subscribed {
+            let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
+            self.subscribed = self.client.try_subscribe_many(self.filters.iter().map(filter)).is_ok();
+        }
+        let mut outbox = self.mailbox.outbox();
+        while let Some(message) = outbox.next_message(self.clock.now()) {
+            let Manner { confirmed, retain } = outbox.manner(&message);
+            let qos = if confirmed { QoS::AtLeastOnce } else { QoS::AtMostOnce };
+            let taken = self.client.try_publish(&message.topic, qos, retain, message.payload.as_bytes());
+            if taken.is_err() {
+                outbox.put_back(message);
+                return false;
+            }
+        }
+        self.subscribed && outbox.is_empty()
+    }
+
+    /// Waits until the library has sent everything and the connection is closed.
+    async fn disconnect(self, mut events: mpsc::Receiver<Seen>) {
+        while self.client.try_disconnect().is_err() {
+            if events.recv().await.is_none() {
+                return;
+            }
+        }
+        while let Some(seen) = events.recv().await {
+            if matches!(seen, Seen::Down { .. }) {
+                return;
+            }
+        }
+    }
+}

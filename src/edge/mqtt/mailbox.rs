@@ -1,0 +1,42 @@
+//! What waits for the broker, where every thread can reach it.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::Notify;
+
+use crate::engine::outbox::Outbox;
+use crate::engine::topics::Message;
+
+/// Where everybody puts messages for the broker, whether it is there or not.
+pub struct Mailbox {
+    outbox: Mutex<Outbox>,
+    pub(super) news: Notify,
+}
+
+impl Mailbox {
+    pub fn new(outbox: Outbox) -> Mailbox {
+        Mailbox { outbox: Mutex::new(outbox), news: Notify::new() }
+    }
+
+    /// Never waits for the broker.
+    pub fn push(&self, message: Message) {
+        self.outbox().push(message);
+        self.news.notify_one();
+    }
+
+    /// Does something with all that waits or is remembered.
+    pub fn change(&self, change: impl FnOnce(&mut Outbox)) {
+        change(&mut self.outbox());
+        self.news.notify_one();
+    }
+
+    /// Looks at what waits or is remembered.
+    pub fn look<T>(&self, look: impl FnOnce(&Outbox) -> T) -> T {
+        look(&self.outbox())
+    }
+
+    pub(super) fn outbox(&self) -> MutexGuard<'_, Outbox> {
+        // The outbox is whole after every call, whoever panicked meanwhile.
+        self.outbox.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

@@ -1,0 +1,170 @@
+//! The connection to the broker. One task does nothing but poll the client library; another feeds it
+//! with what the outbox holds, and hands on what comes in.
+
+mod feeder;
+mod losses;
+mod mailbox;
+mod poller;
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use rumqttc::{AsyncClient, LastWill, MqttOptions, QoS};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
+
+use self::feeder::Feeder;
+pub use self::feeder::News;
+use self::losses::Ends;
+pub use self::mailbox::Mailbox;
+use self::poller::Poller;
+use crate::edge::clock::Clock;
+use crate::edge::secrets::Secrets;
+use crate::engine::connection::Connection;
+use crate::engine::health::BrokerReport;
+use crate::engine::settings::{Mqtt, Settings};
+use crate::engine::time::Duration;
+use crate::engine::topics::{self, OFFLINE, Topics};
+
+/// Requests that the library may hold; the others wait in the outbox, where a newer value replaces an
+/// older one.
+const IN_FLIGHT: usize = 50;
+
+/// A device with a thousand points is announced in 215 kB. Larger than anything sane, since a packet
+/// above the limit ends the connection.
+const PACKET_BYTES_MAX: usize = 16 * 1024 * 1024;
+
+/// How long the last messages may take when the program ends.
+const GOODBYE: Duration = Duration::from_secs(3);
+
+/// How the connection is, for whoever wants to tell.
+#[derive(Clone)]
+pub struct BrokerState {
+    state: Arc<Mutex<BrokerReport>>,
+    connection: Arc<Mutex<Connection>>,
+    mailbox: Arc<Mailbox>,
+    clock: Clock,
+}
+
+impl BrokerState {
+    pub fn report(&self) -> BrokerReport {
+        let mut report = lock(&self.state).clone();
+        report.client_id_taken = lock(&self.connection).is_contested(self.clock.now());
+        let outbox = self.mailbox.outbox();
+        (report.waiting, report.dropped) = (outbox.waiting(), outbox.dropped());
+        drop(outbox);
+        report
+    }
+}
+
+/// The running connection.
+pub struct Broker {
+    state: BrokerState,
+    goodbye: Option<oneshot::Sender<()>>,
+    feeder: JoinHandle<()>,
+}
+
+impl Broker {
+    /// Connects, and goes on connecting. `tell` is called from the runtime and must not wait.
+    pub fn start(
+        settings: &Settings,
+        secrets: Secrets,
+        clock: Clock,
+        mailbox: Arc<Mailbox>,
+        tell: impl Fn(News) + Send + 'static,
+    ) -> Broker {
+        let topics = Topics::of(&settings.mqtt);
+        let options = options(&settings.mqtt, &topics, secrets);
+        let client_id = options.client_id();
+        let (client, event_loop) = AsyncClient::new(options, IN_FLIGHT);
+        let state = Arc::new(Mutex::new(BrokerReport::default()));
+        let connection = Arc::new(Mutex::new(Connection::default()));
+        let (events_out, events) = mpsc::channel(IN_FLIGHT);
+        let poller = Poller {
+            event_loop,
+            seen: events_out,
+            connection: connection.clone(),
+            mqtt: settings.mqtt.clone(),
+            ends: Ends {
+                address: format!("{}:{}", settings.mqtt.host, settings.mqtt.port),
+                client_id,
+                base_topic: settings.mqtt.base_topic.clone(),
+            },
+            unreadable: None,
+            clock,
+        };
+        let poller = tokio::spawn(poller.run());
+        let (goodbye, goodbye_heard) = oneshot::channel();
+        let mut filters = topics.subscriptions();
+        if settings.home_assistant.discovery {
+            filters.push(settings.home_assistant.status_topic.clone());
+            // What an earlier run announced, to take away what is gone.
+            filters.push(topics::discovery(&settings.home_assistant.prefix, "+"));
+        }
+        let feeder = Feeder {
+            client,
+            clock,
+            topics,
+            status_topic: settings.home_assistant.status_topic.clone(),
+            filters,
+            mailbox: mailbox.clone(),
+            state: state.clone(),
+            connected: false,
+            contested: false,
+            told_up: None,
+            subscribed: false,
+            tell,
+        };
+        let feeder = tokio::spawn(async move {
+            feeder.run(events, goodbye_heard).await;
+            poller.abort();
+        });
+        let state = BrokerState { state, connection, mailbox, clock };
+        Broker { state, goodbye: Some(goodbye), feeder }
+    }
+
+    pub fn state(&self) -> BrokerState {
+        self.state.clone()
+    }
+
+    /// Sends what waits, then `offline`, and disconnects, so that no last will follows. Gives up after
+    /// some seconds: then the last will says the same.
+    pub async fn finish(mut self) {
+        if let Some(goodbye) = self.goodbye.take() {
+            // The other side is gone only if the feeder has ended already.
+            let _ = goodbye.send(());
+        }
+        if tokio::time::timeout(GOODBYE, &mut self.feeder).await.is_err() {
+            tracing::warn!("the broker did not take the last messages in time");
+            self.feeder.abort();
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn options(mqtt: &Mqtt, topics: &Topics, secrets: Secrets) -> MqttOptions {
+    // The same after every start: a gateway that was cut off takes its own place again. And the same
+    // for every gateway with this base topic: of two that would answer for the same devices, the broker
+    // lets in one.
+    let client = format!("{}_gateway", topics.instance());
+    let address = match &mqtt.websocket {
+        None => mqtt.host.clone(),
+        // The library wants a whole URL.
+        Some(path) => {
+            let scheme = if mqtt.tls.is_some() { "wss" } else { "ws" };
+            let host = if mqtt.host.contains(':') { format!("[{}]", mqtt.host) } else { mqtt.host.clone() };
+            format!("{scheme}://{host}:{}{path}", mqtt.port)
+        }
+    };
+    let mut options = MqttOptions::new(client, address, mqtt.port);
+    // Told to the broker in whole seconds.
+    options.set_keep_alive(Duration::from_secs(mqtt.keep_alive.as_millis().div_ceil(1000) as u64));
+    // A command is for now: the broker shall not keep any for a gateway that is not there.
+    options.set_clean_session(true);
+    options.set_max_packet_size(PACKET_BYTES_MAX, PACKET_BYTES_MAX);
+    options.set_last_will(LastWill::new(topics.bridge_state(), OFFLINE, QoS::AtLeastOnce, true));
+    secrets.enter(&mut options, mqtt);
+    options
+}

@@ -1,0 +1,204 @@
+//! Polls the client library and connects again: what came, and that a connection was made or lost.
+
+use std::sync::{Arc, Mutex};
+
+use rumqttc::{ConnectionError, EventLoop, Outgoing, Packet, Publish, Request};
+use tokio::sync::mpsc;
+
+use super::lock;
+use super::losses::{Ends, loss};
+use crate::edge::clock::Clock;
+use crate::edge::secrets::Secrets;
+use crate::engine::connection::Connection;
+use crate::engine::settings::Mqtt;
+use crate::engine::time::Duration;
+use crate::engine::topics::Message;
+
+/// Polls the client library and nothing else: a library that is not polled neither sends nor answers
+/// pings. Waits between attempts to connect.
+pub(super) struct Poller {
+    pub event_loop: EventLoop,
+    pub seen: mpsc::Sender<Seen>,
+    pub connection: Arc<Mutex<Connection>>,
+    pub mqtt: Mqtt,
+    pub ends: Ends,
+    /// Why its files could not be read, the last time.
+    pub unreadable: Option<String>,
+    pub clock: Clock,
+}
+
+impl Poller {
+    /// Until nobody listens.
+    pub async fn run(mut self) {
+        loop {
+            let seen = match self.event_loop.poll().await {
+                Ok(rumqttc::Event::Incoming(Packet::ConnAck(_))) => {
+                    let wait = lock(&self.connection).made(self.clock.now());
+                    tokio::time::sleep(wait).await;
+                    Seen::Up
+                }
+                Ok(event) => self.seen(event),
+                Err(error) => {
+                    if self.lost(error).await.is_err() {
+                        return;
+                    }
+                    continue;
+                }
+            };
+            if self.seen.send(seen).await.is_err() {
+                return;
+            }
+        }
+    }
+
+    fn seen(&self, event: rumqttc::Event) -> Seen {
+        let now = self.clock.now();
+        let mut connection = lock(&self.connection);
+        match event {
+            rumqttc::Event::Incoming(packet) => {
+                connection.heard(now);
+                Seen::Packet { packet, stale_for: connection.stale_for(now) }
+            }
+            rumqttc::Event::Outgoing(sent) => {
+                if let Outgoing::Publish(_) | Outgoing::Subscribe(_) | Outgoing::PingReq = sent {
+                    connection.asked(now);
+                }
+                Seen::Room
+            }
+        }
+    }
+
+    /// Tells what is left of the connection, and waits before the next attempt.
+    async fn lost(&mut self, error: ConnectionError) -> Result<(), mpsc::error::SendError<Seen>> {
+        // What came together with the end. The library would hand it out after the next connect,
+        // when a command in it is no longer meant.
+        for event in std::mem::take(&mut self.event_loop.state.events) {
+            if let rumqttc::Event::Incoming(_) = event {
+                self.seen.send(self.seen(event)).await?;
+            }
+        }
+        // A collision of packet numbers from the old connection would stop publishing for ever.
+        let collided = self.event_loop.state.collision.take();
+        let now = self.clock.now();
+        let (was_made, pause, contested) = {
+            let mut connection = lock(&self.connection);
+            let was_made = connection.is_made();
+            let pause = connection.lost(now, loss(&error), now.0);
+            (was_made, pause, connection.is_contested(now))
+        };
+        let reason = match contested {
+            true => self.ends.contested(),
+            false => self.ends.reason(&error, was_made),
+        };
+        self.seen.send(Seen::Down { reason, contested }).await?;
+        tokio::time::sleep(pause).await;
+        // Only now, when nobody hands over more: the library would send what it still holds before
+        // anything newer, or drop it.
+        self.event_loop.clean();
+        let requests = self.event_loop.pending.drain(..).filter_map(|request| match request {
+            Request::Publish(publish) => Some(publish),
+            _ => None,
+        });
+        let unsent: Vec<Message> =
+            requests.chain(collided).filter(|publish| !publish.retain).filter_map(once).collect();
+        self.renew_secrets();
+        self.seen.send(Seen::Unsent(unsent)).await
+    }
+
+    /// They may have changed since the last attempt. While they cannot be read, the old ones are used.
+    fn renew_secrets(&mut self) {
+        match Secrets::read(&self.mqtt) {
+            Ok(secrets) => {
+                self.unreadable = None;
+                secrets.enter(&mut self.event_loop.mqtt_options, &self.mqtt);
+            }
+            Err(error) => {
+                let reason = format!("{error:#}");
+                if self.unreadable.as_ref() != Some(&reason) {
+                    tracing::warn!("going on with what was read before: {reason}");
+                }
+                self.unreadable = Some(reason);
+            }
+        }
+    }
+}
+
+/// What the polling task saw.
+pub(super) enum Seen {
+    Up,
+    Down {
+        reason: String,
+        /// Somebody else takes this gateway's place again and again.
+        contested: bool,
+    },
+    /// Messages told once that the library had taken and the broker has not.
+    Unsent(Vec<Message>),
+    Packet {
+        packet: Packet,
+        /// How old it may be, if it was held up on its way.
+        stale_for: Option<Duration>,
+    },
+    /// The library has taken something: there is room for more.
+    Room,
+}
+
+/// A message that the library gives back.
+fn once(publish: Publish) -> Option<Message> {
+    // It was text when it was handed over.
+    Some(Message::once(publish.topic, String::from_utf8(publish.payload.to_vec()).ok()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use rumqttc::{AsyncClient, MqttOptions, QoS, StateError};
+
+    use super::*;
+    use crate::engine::settings::{Layout, Manner, Password};
+
+    /// The library keeps such a message, and would hand it out after the next connect.
+    #[test]
+    fn what_came_with_the_end_of_a_connection_is_handed_on_before_the_end_is_told() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
+        runtime.block_on(async {
+            let (_client, mut event_loop) = AsyncClient::new(MqttOptions::new("id", "localhost", 1883), 10);
+            let command = Publish::new("busker/a/b/set", QoS::AtLeastOnce, "ON");
+            let command = Packet::Publish(command);
+            event_loop.state.events.push_back(rumqttc::Event::Incoming(command.clone()));
+            let (seen, mut events) = mpsc::channel(10);
+            let mqtt = Mqtt {
+                host: "localhost".into(),
+                port: 1883,
+                websocket: None,
+                tls: None,
+                keep_alive: Duration::from_secs(15),
+                username: None,
+                password: Password::None,
+                base_topic: "busker".into(),
+                topics: Layout::default(),
+                values: Manner::default(),
+                json: false,
+            };
+            let mut poller = Poller {
+                event_loop,
+                seen,
+                connection: Arc::new(Mutex::new(Connection::default())),
+                mqtt,
+                ends: Ends {
+                    address: "localhost:1883".into(),
+                    client_id: "id".into(),
+                    base_topic: "busker".into(),
+                },
+                unreadable: None,
+                clock: Clock::start(),
+            };
+            lock(&poller.connection).made(poller.clock.now());
+            let end = ConnectionError::MqttState(StateError::ConnectionAborted);
+            let task = tokio::spawn(async move { poller.lost(end).await.is_ok() });
+            let first = events.recv().await.expect("two things are told");
+            assert!(matches!(first, Seen::Packet { packet, stale_for: None } if packet == command));
+            let second = events.recv().await.expect("two things are told");
+            assert!(matches!(second, Seen::Down { reason, contested: false } if reason.contains("`id`")));
+            task.abort();
+        });
+    }
+}

@@ -1,0 +1,54 @@
+//! What everything on a bus shares.
+
+use std::collections::VecDeque;
+
+use super::{Action, Severity};
+use crate::engine::homeassistant::Gateway;
+use crate::engine::settings::Settings;
+use crate::engine::time::{Date, Duration, Time};
+use crate::engine::topics::{DeviceTopics, Message};
+
+/// Where messages go, how they are told, and the actions that wait to be taken.
+pub(super) struct Context {
+    pub(super) actions: VecDeque<Action>,
+    pub(super) gateway: Gateway,
+    pub(super) discovery: bool,
+    /// Whether each device tells all its values in one message too.
+    pub(super) json: bool,
+    pub(super) bus_name: String,
+    pub(super) republish: Duration,
+    /// A moment, and its date as far as that is known.
+    pub(super) date: Option<(Time, Date)>,
+}
+
+impl Context {
+    pub(super) fn new(settings: &Settings, bus_name: &str) -> Context {
+        Context {
+            actions: VecDeque::from([Action::Reopen { after: Duration::ZERO }]),
+            gateway: Gateway::new(&settings.mqtt, &settings.home_assistant),
+            discovery: settings.home_assistant.discovery,
+            json: settings.mqtt.json,
+            bus_name: bus_name.to_string(),
+            republish: settings.republish,
+            date: None,
+        }
+    }
+
+    pub(super) fn publish(&mut self, message: Message) {
+        self.actions.push_back(Action::Publish(message));
+    }
+
+    pub(super) fn topics_of(&self, device: &str) -> DeviceTopics {
+        self.gateway.topics.of_device(&self.bus_name, device)
+    }
+
+    /// The date at a time that has passed.
+    pub(super) fn date_of(&self, time: Time) -> Option<Date> {
+        let (now, date) = self.date?;
+        Some(Date(date.0.saturating_sub((now - time).as_secs())))
+    }
+
+    pub(super) fn say(&mut self, severity: Severity, text: String) {
+        self.actions.push_back(Action::Say(severity, text));
+    }
+}

@@ -1,0 +1,65 @@
+//! All values of a device in one message, for who wants them together: as they were told on their own
+//! topics, and not more often than once in a second.
+
+use crate::engine::device::ThingKind;
+use crate::engine::time::{Duration, Time};
+use crate::engine::topics::Message;
+
+use super::{Context, DeviceState};
+
+/// What changes in this time is told together.
+const INTERVAL: Duration = Duration::from_secs(1);
+
+/// Whether the message is due, and since when it may be told.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Whole {
+    changed: bool,
+    not_before: Time,
+}
+
+impl Whole {
+    /// Something of it has been told on its own topic.
+    pub(super) fn has_changed(&mut self) {
+        self.changed = true;
+    }
+}
+
+impl DeviceState {
+    /// When the message is told, if something has changed.
+    pub(in crate::engine::bus) fn whole_due_at(&self) -> Option<Time> {
+        self.whole.changed.then_some(self.whole.not_before)
+    }
+
+    /// Tells the message, if it is due.
+    pub(in crate::engine::bus) fn tell_whole(&mut self, now: Time, context: &mut Context) {
+        if self.whole_due_at().is_none_or(|due| now < due) {
+            return;
+        }
+        self.whole = Whole { changed: false, not_before: now + INTERVAL };
+        let topics = context.topics_of(&self.settings.name);
+        context.publish(Message::retained(topics.json(), self.whole_json()));
+    }
+
+    /// `{"flow":21.50,"relay_1":"ON","mode":"direct","pressure":null}`. Made here and not by a library, which
+    /// would drop the last zero of a number.
+    fn whole_json(&self) -> String {
+        let device = &self.settings.device;
+        let points = device.points.iter().enumerate();
+        let points =
+            points.filter(|(_, point)| !point.is_button() && point.event.is_none()).map(|(index, point)| {
+                let told = self.values.told(index).map_or("null".into(), |reading| reading.to_json());
+                (&point.name, told)
+            });
+        let things = device.things.iter().filter(|thing| thing.kind != ThingKind::Button).map(|thing| {
+            let state = self.state_of(thing).map_or("null".into(), quoted);
+            (&thing.name, state)
+        });
+        let members: Vec<String> =
+            points.chain(things).map(|(name, value)| format!("{}:{value}", quoted(name))).collect();
+        format!("{{{}}}", members.join(","))
+    }
+}
+
+fn quoted(text: &str) -> String {
+    serde_json::Value::from(text).to_string()
+}

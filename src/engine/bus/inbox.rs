@@ -1,0 +1,100 @@
+//! What waits for a bus's attention: bounded, and of several values for a point the newest stays.
+
+use std::collections::VecDeque;
+
+use super::{Command, Event};
+
+/// Events that wait until the bus takes them.
+#[derive(Debug, Default)]
+pub struct Inbox {
+    events: VecDeque<Event>,
+    closed: bool,
+}
+
+/// There is no room, or nobody takes anything any more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Full;
+
+impl Inbox {
+    /// The bus takes all of them between two looks at the line, so this fills only when something floods it.
+    pub const LIMIT: usize = 256;
+
+    /// Adds an event. When there is no room, a command takes the place of the last one for the same point, which
+    /// is returned.
+    pub fn push(&mut self, event: Event) -> Result<Option<Command>, Full> {
+        if self.closed {
+            return Err(Full);
+        }
+        if self.events.len() < Inbox::LIMIT {
+            self.events.push_back(event);
+            return Ok(None);
+        }
+        let Event::Command(command) = &event else { return Err(Full) };
+        let is_older = |other: &Event| match other {
+            Event::Command(other) => {
+                let same = (&other.device, &other.point) == (&command.device, &command.point);
+                same && other.retained == command.retained
+            }
+            _ => false,
+        };
+        let at = self.events.iter().rposition(is_older).ok_or(Full)?;
+        match std::mem::replace(&mut self.events[at], event) {
+            Event::Command(older) => Ok(Some(older)),
+            _ => Err(Full),
+        }
+    }
+
+    /// The first of them.
+    pub fn take(&mut self) -> Option<Event> {
+        self.events.pop_front()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.events.is_empty()
+    }
+
+    /// Nobody takes anything any more.
+    pub fn close(&mut self) {
+        self.closed = true;
+        self.events.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(point: &str, value: usize) -> Event {
+        let payload = value.to_string();
+        Event::Command(Command { device: "valves".into(), point: point.into(), payload, retained: false })
+    }
+
+    #[test]
+    fn a_flood_of_values_ends_in_the_newest_and_nothing_is_lost_without_a_word() {
+        let mut inbox = Inbox::default();
+        let mut replaced = Vec::new();
+        assert_eq!(inbox.push(set("output_2", 7)), Ok(None));
+        for value in 0..1000 {
+            replaced.extend(inbox.push(set("output_1", value)).expect("of these the newest stays"));
+        }
+        assert_eq!(inbox.push(Event::BrokerUp), Err(Full));
+        assert_eq!(inbox.push(set("output_3", 7)), Err(Full));
+        let mut waiting = Vec::new();
+        while let Some(Event::Command(command)) = inbox.take() {
+            waiting.push(command);
+        }
+        assert_eq!(waiting.len(), Inbox::LIMIT);
+        assert_eq!((waiting[0].point.as_str(), waiting[0].payload.as_str()), ("output_2", "7"));
+        assert_eq!(waiting.len() + replaced.len(), 1001);
+        assert_eq!(waiting[Inbox::LIMIT - 1].payload, "999", "it is taken last");
+        assert!(replaced.iter().all(|command| command.payload != "999"));
+    }
+
+    #[test]
+    fn who_has_gone_takes_nothing() {
+        let mut inbox = Inbox::default();
+        assert_eq!(inbox.push(Event::BrokerUp), Ok(None));
+        inbox.close();
+        assert_eq!((inbox.push(Event::BrokerUp), inbox.take()), (Err(Full), None));
+    }
+}

@@ -1,0 +1,66 @@
+//! What is taken out of the configuration while the gateway is off, and the broker forgets meanwhile: Home
+//! Assistant does not forget.
+
+use super::rig::{self, Broker, Gateway, Received, Watcher};
+use super::{json, over_tcp, simulation};
+
+const RELAYS: &str = "homeassistant/device/busker_relays/config";
+const BOARD: &str = "homeassistant/device/busker_board/config";
+
+#[test]
+fn nothing_is_left_in_home_assistant_of_what_only_the_gateway_remembers() {
+    let (mut broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let url = format!("mqtt: {{url: 'mqtt://127.0.0.1:{}'}}", broker.port);
+    let text = |points: &str, more: &str| {
+        format!(
+            "{url}\nbuses: {{line: {{tcp: '{}'}}}}\ndevices:\n  board: {{bus: line, unit: 20, points: {{{points}}}}}\n{more}",
+            port.address()
+        )
+    };
+    let both = "one: {at: input 0, poll: fast}, two: {at: input 1, poll: fast}";
+    let relays = "  relays: {profile: metz-connect/mr-do4, bus: line, unit: 18}\n";
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start_with(&text(both, relays));
+    watcher.wait_for("busker/relays/availability", "online");
+    watcher.wait_for("busker/board/availability", "online");
+    let remembered = gateway.file().with_file_name("state").join("announced.json");
+    let holds = |topics: &[&str]| {
+        let stored = std::fs::read_to_string(&remembered).ok()?;
+        topics.iter().all(|topic| stored.contains(topic)).then_some(())
+    };
+    rig::eventually(|| holds(&[RELAYS, BOARD])).expect("what is announced is remembered");
+    drop(watcher);
+
+    let forgets = || {
+        broker.kill();
+        broker.restart();
+    };
+    let gateway = gateway.start_again(forgets, &text("one: {at: input 0, poll: fast}", ""));
+    let watcher = Watcher::start(&broker, "watcher");
+    watcher.publish("homeassistant/status", "online");
+    // Home Assistant lets go only of what it has been told since its start, so that comes first.
+    let told = |topic: &str| -> Vec<String> {
+        watcher
+            .received()
+            .into_iter()
+            .filter(|got| got.topic == topic && !got.retained)
+            .map(|got| got.payload)
+            .collect()
+    };
+    let is_removed = |got: &Received| got.topic == RELAYS && got.payload.is_empty();
+    watcher.wait_until("the removal of the relays", is_removed);
+    let all = told(RELAYS);
+    let before = all.iter().rposition(|payload| !payload.is_empty()).expect("it was announced before");
+    assert!(all[before].contains("relay_1") && before + 1 < all.len(), "{all:?}");
+    let tombstone = serde_json::json!({"platform": "sensor"});
+    let is_buried =
+        |got: &Received| got.topic == BOARD && json(&got.payload)["components"]["two"] == tombstone;
+    watcher.wait_until("the burial of the point", is_buried);
+    let gone = rig::eventually(|| {
+        let stored = std::fs::read_to_string(&remembered).ok()?;
+        (!stored.contains(RELAYS) && stored.contains(BOARD) && !stored.contains("board_two")).then_some(())
+    });
+    assert!(gone.is_some(), "what is taken away is forgotten");
+    assert!(gateway.terminate().success());
+}
