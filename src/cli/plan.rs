@@ -11,7 +11,7 @@ use super::{Failure, configuration};
 use crate::engine::device::Device;
 use crate::engine::plan::{self, Cost, Read};
 use crate::engine::profile::Library;
-use crate::engine::settings::{Line, Link, Parity};
+use crate::engine::settings::{Line, Link, Parity, Rs485};
 use crate::engine::time::Duration;
 
 /// Before a device's own latency is measured.
@@ -80,7 +80,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
 
 fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
-    let cost = Cost::of(&Link::Serial { path: String::new(), line }, TURNAROUND);
+    let cost = Cost::of(&Link::Serial { path: String::new(), line, rs485: Rs485::Auto }, TURNAROUND);
     if id.ends_with(".yaml") {
         return Ok(plan_of(id, &load_file(Path::new(id))?, cost));
     }

@@ -52,6 +52,8 @@ const DAMAGED_MIN: u32 = 4;
 pub struct Guard {
     line: Line,
     gap: Duration,
+    /// From handing a frame over until its first bit: a transceiver is switched.
+    delay_before_send: Duration,
     /// `None`: as long as the request's own timeout.
     quarantine: Option<Duration>,
     state: State,
@@ -111,6 +113,7 @@ impl Guard {
         Guard {
             line,
             gap: whole_micros(gap.unwrap_or_else(|| line.frame_gap())),
+            delay_before_send: Duration::ZERO,
             quarantine,
             state: State::Idle,
             frame: Vec::new(),
@@ -123,6 +126,11 @@ impl Guard {
             lateness: BTreeMap::new(),
             discarded: Discarded::default(),
         }
+    }
+
+    /// The same line, on which a frame waits so long before its first bit.
+    pub fn with_delay_before_send(self, delay_before_send: Duration) -> Guard {
+        Guard { delay_before_send, ..self }
     }
 
     /// Takes the next request. A reply at once means that it cannot be asked on this line.
@@ -165,7 +173,7 @@ impl Guard {
         };
         self.drop_strays(self.heard.len());
         self.quarantine_until = None;
-        let transmitted_at = now + self.line.characters(self.frame.len() as u32);
+        let transmitted_at = now + self.delay_before_send + self.line.characters(self.frame.len() as u32);
         self.busy_until = Some(transmitted_at);
         let wait = if request.unit == 0 { TURNAROUND } else { timeout };
         let deadline = transmitted_at + wait;

@@ -209,6 +209,16 @@ fn the_timeout_counts_from_the_requests_last_bit_and_waits_while_bytes_flow() {
 }
 
 #[test]
+fn a_frame_that_waits_for_its_transceiver_is_given_that_time_too() {
+    let delay = Duration::from_millis(40);
+    let mut scene = Scene::new();
+    scene.guard = Guard::new(LINE, None, None).with_delay_before_send(delay);
+    let (reply, after) = scene.ask(&two_inputs()).reply();
+    assert_eq!(reply.result, Err(RequestError::Timeout));
+    assert_eq!(after, Time(0) + delay + TIMEOUT + LINE.characters(8) - Time(0));
+}
+
+#[test]
 fn before_each_request_the_line_is_silent() {
     let mut scene = Scene::without_echo();
     let answered_at = scene.now;
