@@ -10,6 +10,7 @@ mod change;
 mod commands;
 mod device;
 mod fetch;
+mod line;
 mod pause;
 mod requests;
 mod waiting;
@@ -137,6 +138,7 @@ pub struct Bus {
     unanswered: u32,
     broker_up: bool,
     counters: Counters,
+    line: line::Line,
     load: Load,
     stopping: bool,
     /// When something is to be stored next.
@@ -254,6 +256,7 @@ impl Bus {
             unanswered: 0,
             broker_up: true,
             counters,
+            line: line::Line::default(),
             load: Load::default(),
             stopping: false,
             record_due_at,
@@ -344,7 +347,7 @@ impl Bus {
     /// The same without points, which are most of it.
     pub fn summary(&self, now: Time) -> BusReport {
         let reason = match &self.link_state {
-            LinkState::Up | LinkState::Renewing => None,
+            LinkState::Up | LinkState::Renewing => self.line.trouble(now),
             LinkState::Down { reason, .. } => Some(reason.clone().unwrap_or("not yet open".into())),
             LinkState::Paused { reason } => Some(reason.clone()),
         };
@@ -420,6 +423,8 @@ impl Bus {
             self.unanswered =
                 if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
         }
+        self.look_for_others(&reply);
+        let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         self.request_ended(in_flight, reply.result);
         self.renew_silent_connection();
     }
@@ -652,7 +657,7 @@ impl Bus {
             before: Some(before),
             gives_way,
         });
-        self.context.actions.push_back(Action::Send { request, not_before, timeout });
+        self.ask(request, not_before, timeout);
     }
 
     /// Asks a unit that is no device of this gateway.
@@ -660,7 +665,7 @@ impl Bus {
         let (now, timeout) = (self.now, self.response_timeout);
         self.in_flight =
             Some(InFlight { device: None, purpose, sent_at: now, before: None, gives_way: false });
-        self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
+        self.ask(request, now, timeout);
     }
 }
 
