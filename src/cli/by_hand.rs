@@ -66,7 +66,7 @@ struct WhichLine {
     config: Option<PathBuf>,
 }
 
-fn parity(name: &str) -> Result<Parity, String> {
+pub fn parity(name: &str) -> Result<Parity, String> {
     match name {
         "none" => Ok(Parity::None),
         "even" => Ok(Parity::Even),

@@ -206,6 +206,12 @@ impl Line {
         Duration::from_nanos(nanos / u64::from(self.baud))
     }
 
+    /// How long a byte's stop bits last after it has been handed over at the latest: a receiver reports it
+    /// in the middle of the first one. Who sends before is heard at the same time as the sender.
+    pub fn stop(self) -> Duration {
+        self.characters(self.stop_bits.into()) / self.bits_per_character()
+    }
+
     /// The silence between two frames: 3.5 characters, and 1.75 ms above 19200 baud (Modbus over
     /// serial line specification V1.02, 2.5.1.1).
     pub fn frame_gap(self) -> Duration {

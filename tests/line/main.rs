@@ -2,6 +2,7 @@
 //! fault is counted as what it was, and the next reading is right.
 
 mod by_hand;
+mod doctor;
 mod peer;
 #[path = "../support/mod.rs"]
 mod support;

@@ -1,6 +1,7 @@
 //! A link moves bytes: a serial port or a TCP connection, both as a descriptor that never blocks.
 
 pub mod adapter;
+pub mod check_up;
 pub mod driver;
 mod serial;
 mod tcp;

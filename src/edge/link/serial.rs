@@ -116,7 +116,7 @@ fn switch_direction(descriptor: &OwnedFd, path: &str, rs485: Rs485) -> Result<()
     }
 }
 
-fn why_not_opened(path: &str, error: Errno) -> Lost {
+pub(super) fn why_not_opened(path: &str, error: Errno) -> Lost {
     Lost(match error {
         Errno::NOENT | Errno::NODEV | Errno::NXIO | Errno::IO => {
             format!("`{path}` is not there; is the adapter plugged in?")

@@ -114,12 +114,13 @@ struct Found {
 }
 
 impl Guard {
-    /// `gap`: silence before each request, `None`: the line's own. `quarantine`: how long the line
+    /// `gap`: silence before each request, `None`: the line's own; never less than the last byte's stop bits
+    /// take. `quarantine`: how long the line
     /// stays silent after a request timed out, `None`: as long as that request's timeout.
     pub fn new(line: Line, gap: Option<Duration>, quarantine: Option<Duration>) -> Guard {
         Guard {
             line,
-            gap: whole_micros(gap.unwrap_or_else(|| line.frame_gap())),
+            gap: whole_micros(gap.unwrap_or_else(|| line.frame_gap()).max(line.stop())),
             delay_before_send: Duration::ZERO,
             quarantine,
             state: State::Idle,

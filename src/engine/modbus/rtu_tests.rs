@@ -235,8 +235,23 @@ fn before_each_request_the_line_is_silent() {
         scene.wait(1).hears(vec![0x55]);
         assert!(scene.now - begun_at < Duration::from_millis(1100));
     }
-    let wide = Guard::new(LINE, Some(Duration::from_millis(9)), None);
-    assert_eq!(wide.gap, Duration::from_millis(9));
+}
+
+#[test]
+fn no_gap_is_shorter_than_the_stop_bits_of_the_byte_before() {
+    let two = Line { stop_bits: 2, parity: Parity::None, baud: 300 };
+    for (what, line, gap, micros) in [
+        ("a wide one", LINE, Some(9_000), 9_000),
+        ("a narrow one", LINE, Some(100), 100),
+        ("none, as long as it lasts", LINE, Some(0), 53),
+        ("two stop bits on a slow line", two, Some(100), 6_667),
+        ("3.5 characters", LINE, None, 2_006),
+        ("3.5 characters with two stop bits", two, None, 128_334),
+        ("a fast line", Line { baud: 115_200, ..LINE }, None, 1_750),
+    ] {
+        let guard = Guard::new(line, gap.map(Duration::from_micros), None);
+        assert_eq!(guard.gap, Duration::from_micros(micros), "{what}");
+    }
 }
 
 #[test]
