@@ -35,8 +35,6 @@ use fetch::Fetch;
 use requests::Requests;
 use waiting::{Target, WaitingCommands};
 
-/// After so many requests in a row that nobody answers, a TCP connection is made anew.
-const UNANSWERED_UNTIL_RENEWED: u32 = 5;
 /// So many requests in a row may go before a read that is due, because somebody wants them at once. Then
 /// the read has its turn: under a flood of commands every period stretches, but nothing starves.
 const AHEAD_OF_READS: u32 = 8;
@@ -427,17 +425,6 @@ impl Bus {
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         self.request_ended(in_flight, reply.result);
         self.renew_silent_connection();
-    }
-
-    /// A serial server may accept a connection and never pass anything on; only a new one helps. A
-    /// serial port has no such state.
-    fn renew_silent_connection(&mut self) {
-        let is_connection = !matches!(self.link, Link::Serial { .. });
-        if is_connection && self.unanswered >= UNANSWERED_UNTIL_RENEWED && self.link_state == LinkState::Up {
-            self.unanswered = 0;
-            self.link_state = LinkState::Renewing;
-            self.context.actions.push_back(Action::Reopen { after: Duration::ZERO });
-        }
     }
 
     fn request_ended(&mut self, in_flight: InFlight, result: Result<Answer, RequestError>) {
