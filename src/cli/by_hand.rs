@@ -16,7 +16,7 @@ use crate::engine::identity;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
 use crate::engine::profile::Library;
-use crate::engine::settings::{self, Line, Parity};
+use crate::engine::settings::{self, Line, Parity, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::{Scalar, nearest};
 
@@ -66,7 +66,7 @@ struct WhichLine {
     config: Option<PathBuf>,
 }
 
-fn parity(name: &str) -> Result<Parity, String> {
+pub fn parity(name: &str) -> Result<Parity, String> {
     match name {
         "none" => Ok(Parity::None),
         "even" => Ok(Parity::Even),
@@ -94,7 +94,7 @@ impl ByHand {
     pub fn open(&self) -> Result<Asked, Failure> {
         let line = Line { baud: self.baud, parity: self.parity, stop_bits: self.stop_bits };
         let link = match (&self.line.serial, &self.line.tcp, &self.line.rtu_over_tcp) {
-            (Some(path), ..) => settings::Link::Serial { path: path.clone(), line },
+            (Some(path), ..) => settings::Link::Serial { path: path.clone(), line, rs485: Rs485::Auto },
             (_, Some(address), _) => {
                 let (host, port) = host_and_port(address)?;
                 settings::Link::Tcp { host, port }

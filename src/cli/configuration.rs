@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 
 use super::Failure;
+use crate::edge::link::adapter;
 use crate::edge::{files, tls};
 use crate::engine::configuration::{self, Warning};
 use crate::engine::profile::Library;
-use crate::engine::settings::{Password, Settings};
+use crate::engine::settings::{Link, Password, Settings};
 use crate::engine::yaml::Diagnostic;
 
 /// `--config FILE`, for a verb's own arguments by `#[command(flatten)]`.
@@ -69,6 +70,23 @@ impl Loaded {
             found.push(self.at(&["http", "token_file"], format!("{error:#}")));
         }
         found
+    }
+
+    /// What ports that may change their names are called for good, where the system tells it. `folder` is
+    /// usually [`adapter::BY_ID`].
+    pub fn stable_paths(&self, folder: &Path) -> Vec<Diagnostic> {
+        let serial = self.settings.buses.iter().filter_map(|bus| match &bus.link {
+            Link::Serial { path, .. } if !Path::new(path).starts_with(folder) => Some((&bus.name, path)),
+            _ => None,
+        });
+        serial
+            .filter_map(|(bus, path)| {
+                let stable = adapter::stable_path(Path::new(path), folder)?;
+                let message =
+                    format!("`{path}` is `{}` now; that name stays with the adapter", stable.display());
+                Some(self.at(&["buses", bus, "serial"], message))
+            })
+            .collect()
     }
 
     fn at(&self, keys: &[&str], message: String) -> Diagnostic {
@@ -151,6 +169,30 @@ fn nearest(configured: Password, environment: Option<String>, credential: Option
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_port_that_has_a_stable_name_is_told_with_it() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let (port, by_id) = (folder.path().join("ttyUSB0"), folder.path().join("by-id"));
+        fs::write(&port, "").expect("a temporary file");
+        fs::create_dir(&by_id).expect("a temporary folder");
+        let stable = by_id.join("usb-FTDI_A1-if00-port0");
+        std::os::unix::fs::symlink("../ttyUSB0", &stable).expect("a temporary link");
+        let check = |serial: &Path| {
+            let config = folder.path().join("busker.yaml");
+            let text = format!("buses:\n  shed: {{serial: {}}}\n", serial.display());
+            fs::write(&config, text).expect("a temporary file");
+            let Ok(Ok(loaded)) = load(&config) else { panic!("a good configuration") };
+            loaded.stable_paths(&by_id).iter().map(ToString::to_string).collect::<Vec<_>>()
+        };
+        let told = check(&port);
+        assert_eq!(told.len(), 1);
+        assert!(told[0].contains(":2:18: "), "{told:?}");
+        let expected = format!("`{}` is `{}` now; that name stays", port.display(), stable.display());
+        assert!(told[0].contains(&expected), "{told:?}");
+        assert_eq!(check(&stable), Vec::<String>::new());
+        assert_eq!(check(Path::new("/dev/no-such")), Vec::<String>::new());
+    }
 
     #[test]
     fn the_password_comes_from_the_nearest_place_that_has_one() {

@@ -16,6 +16,7 @@ mod check;
 pub mod configuration;
 mod demo;
 mod diagnose;
+mod doctor;
 pub mod log;
 pub mod output;
 mod plan;
@@ -49,6 +50,7 @@ verbs! {
     check Check,
     diagnose Diagnose,
     demo Demo,
+    doctor Doctor,
     plan Plan,
     profiles Profiles,
     read Read,

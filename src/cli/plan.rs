@@ -11,7 +11,7 @@ use super::{Failure, configuration};
 use crate::engine::device::Device;
 use crate::engine::plan::{self, Cost, Read, Tariff, USUAL_TURNAROUND};
 use crate::engine::profile::Library;
-use crate::engine::settings::{Line, Link, Parity};
+use crate::engine::settings::{Line, Link, Parity, Rs485};
 
 /// Show the reads that each device will be asked with
 ///
@@ -76,7 +76,8 @@ pub fn run(args: Args) -> Result<(), Failure> {
 
 fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
-    let cost = Tariff::of(&Link::Serial { path: String::new(), line }, None).cost(USUAL_TURNAROUND);
+    let link = Link::Serial { path: String::new(), line, rs485: Rs485::Auto };
+    let cost = Tariff::of(&link, None).cost(USUAL_TURNAROUND);
     if id.ends_with(".yaml") {
         return Ok(plan_of(id, &load_file(Path::new(id))?, cost));
     }

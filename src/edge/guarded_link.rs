@@ -176,7 +176,7 @@ mod tests {
     use crate::engine::address::{Span, Table};
     use crate::engine::modbus::crc::crc;
     use crate::engine::modbus::{Answer, Call};
-    use crate::engine::settings::{self, Line, Parity};
+    use crate::engine::settings::{self, Direction, Line, Parity, Rs485};
 
     const TIMEOUT: Duration = Duration::from_millis(300);
 
@@ -186,7 +186,7 @@ mod tests {
         unlockpt(&far).expect("a pseudo-terminal");
         let path = ptsname(&far, Vec::new()).expect("its name").into_string().expect("plain letters");
         let line = Line { baud: 115_200, parity: Parity::None, stop_bits: 1 };
-        let settings = settings::Link::Serial { path, line };
+        let settings = settings::Link::Serial { path, line, rs485: Rs485::Auto };
         let link = Link::open(&settings).expect("the port opens");
         (far, GuardedLink::new(link, Guard::new(&settings, None), Clock::start()))
     }
@@ -242,7 +242,7 @@ mod tests {
         unlockpt(&far).expect("a pseudo-terminal");
         let path = ptsname(&far, Vec::new()).expect("its name").into_string().expect("plain letters");
         let line = Line { baud: 9600, parity: Parity::Even, stop_bits: 1 };
-        let serial = |path: &str| settings::Link::Serial { path: path.into(), line };
+        let serial = |path: &str| settings::Link::Serial { path: path.into(), line, rs485: Rs485::Auto };
         let first = Link::open(&serial(&path)).expect("the port opens");
         let why = |path: &str| Link::open(&serial(path)).expect_err("it does not open").0;
         assert_eq!(why(&path), format!("`{path}` is in use by another program"));
@@ -250,6 +250,18 @@ mod tests {
         assert_eq!(why("/dev/no-such"), "`/dev/no-such` is not there; is the adapter plugged in?");
         drop(first);
         Link::open(&serial(&path)).expect("it is free again");
+
+        // A port whose driver cannot switch a transceiver is not opened as if it could, and stays free.
+        let rs485 = |rs485| settings::Link::Serial { path: path.clone(), line, rs485 };
+        let refused = Link::open(&rs485(Rs485::Kernel(Direction::default()))).expect_err("no RTS").0;
+        assert_eq!(
+            refused,
+            format!(
+                "`{path}`: its driver cannot switch an RS485 transceiver; most adapters do it by \
+                 themselves: leave `rs485` out"
+            )
+        );
+        Link::open(&rs485(Rs485::None)).expect("nothing switches anyway");
     }
 
     #[test]

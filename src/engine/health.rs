@@ -22,6 +22,8 @@ pub struct Counters {
     pub answers: u64,
     pub timeouts: u64,
     pub checksum_errors: u64,
+    /// Requests that were damaged because another spoke at the same time.
+    pub collisions: u64,
     pub wrong_frames: u64,
     pub exceptions: u64,
     /// The same by code; in the first place those of a code that the specification does not know.
@@ -37,12 +39,13 @@ pub struct Counters {
 
 impl Counters {
     /// Each counter with its name, in JSON and in metrics.
-    pub fn list(&self) -> [(&'static str, u64); 12] {
+    pub fn list(&self) -> [(&'static str, u64); 13] {
         [
             ("requests", self.requests),
             ("answers", self.answers),
             ("timeouts", self.timeouts),
             ("checksum_errors", self.checksum_errors),
+            ("collisions", self.collisions),
             ("wrong_frames", self.wrong_frames),
             ("exceptions", self.exceptions),
             ("late_replies", self.late_replies),
@@ -87,6 +90,7 @@ impl Counters {
             Err(RequestError::Timeout) => self.timeouts += 1,
             // Counted with what was thrown away.
             Err(RequestError::Checksum) => {}
+            Err(RequestError::Collision) => self.collisions += 1,
             Err(RequestError::WrongFrame) => self.wrong_frames += 1,
             Err(RequestError::Link(_) | RequestError::Impossible(_)) => {}
         }
@@ -102,7 +106,7 @@ pub struct BusReport {
     /// `19200 8E1`; nothing where no serial line is known of.
     pub line: Option<String>,
     pub up: bool,
-    /// Why the link is down.
+    /// Why the link is down, or what is wrong with the line although it is up.
     pub reason: Option<String>,
     /// It is down because somebody wants it so, for a time.
     pub paused: bool,

@@ -134,7 +134,7 @@ pub struct Bus {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Link {
     /// Modbus RTU on a serial port.
-    Serial { path: String, line: Line },
+    Serial { path: String, line: Line, rs485: Rs485 },
     /// Modbus TCP.
     Tcp { host: String, port: u16 },
     /// RTU frames over a TCP connection to a serial server, whose line runs at `line`.
@@ -188,6 +188,12 @@ impl Line {
         Duration::from_nanos(nanos / u64::from(self.baud))
     }
 
+    /// How long a byte's stop bits last after it has been handed over at the latest: a receiver reports it
+    /// in the middle of the first one. Who sends before is heard at the same time as the sender.
+    pub fn stop(self) -> Duration {
+        self.characters(self.stop_bits.into()) / self.bits_per_character()
+    }
+
     /// The silence between two frames: 3.5 characters, and 1.75 ms above 19200 baud (Modbus over
     /// serial line specification V1.02, 2.5.1.1).
     pub fn frame_gap(self) -> Duration {
@@ -215,6 +221,50 @@ pub enum Parity {
     None,
     Even,
     Odd,
+}
+
+/// Who switches an RS485 transceiver between sending and listening.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Rs485 {
+    /// Whoever does it already: most adapters by themselves, the kernel where the device tree says so.
+    #[default]
+    Auto,
+    /// The kernel, by the port's RTS.
+    Kernel(Direction),
+    /// Not the kernel, even if the device tree says so.
+    None,
+}
+
+impl Rs485 {
+    /// How long a frame waits between the write and its first bit.
+    pub const fn delay_before_send(self) -> Duration {
+        match self {
+            Rs485::Kernel(direction) => direction.delay_before_send,
+            Rs485::Auto | Rs485::None => Duration::ZERO,
+        }
+    }
+}
+
+/// How RTS switches the transceiver.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Direction {
+    /// Whether RTS is on, and not off, while a frame is sent.
+    pub rts_on_send: bool,
+    /// From the switch to the first bit, in whole milliseconds as the kernel counts them.
+    pub delay_before_send: Duration,
+    /// From the last bit to the switch back.
+    pub delay_after_send: Duration,
+}
+
+impl Direction {
+    /// The kernel allows no longer delay.
+    pub const DELAY_MAX: Duration = Duration::from_millis(100);
+}
+
+impl Default for Direction {
+    fn default() -> Direction {
+        Direction { rts_on_send: true, delay_before_send: Duration::ZERO, delay_after_send: Duration::ZERO }
+    }
 }
 
 /// One device on one bus.

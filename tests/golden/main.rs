@@ -22,7 +22,7 @@ use std::sync::LazyLock;
 use busker::engine::device::Device;
 use busker::engine::plan::{Read, Table, Tariff, USUAL_TURNAROUND, plan};
 use busker::engine::profile::Library;
-use busker::engine::settings::{Line, Link, Parity};
+use busker::engine::settings::{Line, Link, Parity, Rs485};
 
 #[test]
 fn the_points_are_those_of_the_manual() {
@@ -88,7 +88,7 @@ fn shipped() -> &'static [(String, Device)] {
 /// The plan on the line that these devices leave the factory with.
 fn usual_plan(device: &Device) -> Vec<Read> {
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
-    let link = Link::Serial { path: String::new(), line };
+    let link = Link::Serial { path: String::new(), line, rs485: Rs485::Auto };
     plan(device, Tariff::of(&link, None).cost(USUAL_TURNAROUND), &[])
 }
 

@@ -2,6 +2,7 @@
 //! fault is counted as what it was, and the next reading is right.
 
 mod by_hand;
+mod doctor;
 mod pcapng;
 #[path = "../support/peer.rs"]
 mod peer;
@@ -20,9 +21,10 @@ const LIE: u16 = 9999;
 const TIMEOUT: u64 = 500;
 
 /// The counters that a fault may raise; the others follow the polls.
-const FAULTS: [&str; 8] = [
+const FAULTS: [&str; 9] = [
     "timeouts",
     "checksum_errors",
+    "collisions",
     "wrong_frames",
     "exceptions",
     "late_replies",
@@ -278,6 +280,98 @@ fn an_adapter_may_be_unplugged_and_plugged_in_again() {
         gateway.observer.wait_for("busker/one/a", &truth.to_string());
     }
     assert_eq!(gateway.values("busker/one/a"), [100, 101, 102]);
+}
+
+#[test]
+fn an_adapter_that_comes_back_under_another_name_is_found_by_its_link() {
+    let peer = Peer::on_a_pseudo_terminal();
+    let gateway = Gateway::start(&peer, MIXED);
+    gateway.observer.wait_for("busker/one/a", "100");
+    let old_name = std::fs::read_link(peer.path()).expect("the link leads to a port");
+    assert!(gateway.busker.open_files().contains(&old_name));
+
+    let from = gateway.observer.count();
+    peer.unplug();
+    gateway.observer.wait_for("busker/one/availability", "offline");
+    for topic in ["busker/one/a", "busker/one/relay", "busker/two/a"] {
+        gateway.observer.wait_for(topic, "None");
+    }
+    let info = gateway.observer.payloads("busker/one/info").pop().expect("it has been told");
+    assert!(info.contains("the link is down: unplugged"), "{info}");
+    // The name is free again as soon as the adapter is gone: held, it would force another one on it.
+    let held = |held: &std::path::PathBuf| held.to_string_lossy().starts_with(&*old_name.to_string_lossy());
+    assert!(!gateway.busker.open_files().iter().any(held), "{old_name:?} is still held open");
+
+    // Another one has the old name meanwhile.
+    let taken = peer::Placeholder::take(&old_name);
+    peer.hold(1, 4, 0, 101);
+    peer.plug_in();
+    let new_name = std::fs::read_link(peer.path()).expect("the link leads to a port");
+    assert_ne!(new_name, old_name);
+    gateway.observer.wait_for("busker/one/availability", "online");
+    gateway.observer.wait_for("busker/one/a", "101");
+    gateway.observer.wait_for("busker/two/a", "700");
+    drop(taken);
+    let seen = gateway.observer.seen();
+    let told = seen[from..].iter().filter(|seen| seen.topic == "busker/one/a").map(|seen| &*seen.payload);
+    assert_eq!(told.collect::<Vec<_>>(), ["None", "101"], "nothing else in between");
+}
+
+#[test]
+fn a_request_that_comes_back_damaged_has_collided_and_is_asked_again() {
+    let peer = Peer::on_a_pseudo_terminal();
+    let echoed: Misbehave =
+        |asked, good| vec![Step::Say(asked.frame.clone()), Step::Pause(4), Step::Say(good)];
+    peer.misbehave(echoed);
+    let gateway = Gateway::start(&peer, MIXED);
+    gateway.observer.wait_for("busker/one/a", "100");
+    // What another master asks of the same unit at the same time is answered; it looks like our reply.
+    let collisions: [Misbehave; 3] = [
+        |asked, _| {
+            vec![Step::Say(changed(asked.frame.clone(), |frame| frame[4] ^= 0x3C)), Step::Say(lie(asked))]
+        },
+        |asked, _| vec![Step::Say(rtu(asked.unit, &[4, 0, 99, 0, 1])), Step::Pause(4), Step::Say(lie(asked))],
+        |asked, _| vec![Step::Say(asked.frame[..3].to_vec())],
+    ];
+    for (count, how) in (1..).zip(collisions) {
+        let from = gateway.observer.count();
+        peer.misbehave_once(1, 4, 0, how);
+        peer.hold(1, 4, 0, 100 + count);
+        assert_eq!(gateway.observer.wait_for_next("busker/one/a", from), (100 + count).to_string());
+        wait_for("the collision to be counted", || (gateway.bus()?["collisions"] == count).then_some(()));
+    }
+    assert_eq!(gateway.values("busker/one/a"), [100, 101, 102, 103]);
+    assert!(!gateway.observer.payloads("busker/one/availability")[1..].contains(&"offline".to_string()));
+    let bus = wait_for("the API", || gateway.bus());
+    assert_eq!((&bus["timeouts"], &bus["checksum_errors"]), (&0.into(), &0.into()), "{bus}");
+
+    // A write whose echo is damaged is not confirmed by what follows, but by what the unit holds.
+    peer.misbehave_once(1, 5, 0, |asked, good| {
+        vec![Step::Say(changed(asked.frame.clone(), |frame| frame[2] ^= 1)), Step::Pause(30), Step::Say(good)]
+    });
+    assert_eq!(gateway.set_relay("ON")["outcome"], "done");
+    wait_for("the collision to be counted", || (gateway.bus()?["collisions"] == 4).then_some(()));
+}
+
+#[test]
+fn a_second_master_is_told_and_the_link_stays() {
+    let peer = Peer::on_a_pseudo_terminal();
+    let gateway = Gateway::start(&peer, MIXED);
+    gateway.observer.wait_for("busker/one/a", "100");
+    peer.misbehave_once(1, 4, 0, |_, good| {
+        let others = [rtu(7, &[3, 0, 0, 0, 2]), rtu(7, &read_pdu(3, &[LIE, LIE])), rtu(7, &[3, 0, 2, 0, 2])];
+        let said = others.into_iter().flat_map(|frame| [Step::Pause(10), Step::Say(frame)]);
+        [Step::Say(good)].into_iter().chain(said).collect()
+    });
+    let told = "another master speaks on this line: 2 requests to unit 7 in the last minute";
+    let bus = wait_for("the second master to be told", || gateway.bus().filter(|bus| bus["reason"] == told));
+    assert_eq!((&bus["up"], &bus["foreign_frames"]), (&true.into(), &3.into()), "{bus}");
+    let health = wait_for("the health", || gateway.busker.json("/health"));
+    assert_eq!(health["buses"]["line"]["reason"], told);
+    assert!(gateway.busker.log().contains(&format!("bus line: {told}")));
+    peer.hold(1, 4, 0, 101);
+    gateway.observer.wait_for("busker/one/a", "101");
+    assert_eq!(gateway.values("busker/one/a"), [100, 101]);
 }
 
 /// Two units, with points of several kinds.

@@ -109,8 +109,14 @@ fn a_paused_bus_gives_its_port_away_and_takes_it_back() {
     wait_until_all_is_online(&watcher);
     let path = line.path().display().to_string();
     let line_settings = Line { baud: 19200, parity: Parity::Even, stop_bits: 1 };
-    let is_taken =
-        || Link::open(&settings::Link::Serial { path: path.clone(), line: line_settings }).is_err();
+    let is_taken = || {
+        Link::open(&settings::Link::Serial {
+            path: path.clone(),
+            line: line_settings,
+            rs485: settings::Rs485::Auto,
+        })
+        .is_err()
+    };
     assert!(is_taken(), "the port is the gateway's alone");
 
     let paused = ask(&watcher, "pause", json!({"bus": "line", "for": "10m"}), "1");

@@ -168,6 +168,12 @@ impl Busker {
         self.log.lock().expect("nobody panics with it").clone()
     }
 
+    /// The files that it holds open.
+    pub fn open_files(&self) -> Vec<PathBuf> {
+        let folder = fs::read_dir(format!("/proc/{}/fd", self.child.id())).expect("it runs");
+        folder.filter_map(|entry| fs::read_link(entry.ok()?.path()).ok()).collect()
+    }
+
     /// `GET path`; `None` while nobody answers.
     pub fn get(&self, path: &str) -> Option<String> {
         let url = format!("http://{}{path}", self.http.as_ref()?);

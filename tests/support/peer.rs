@@ -250,6 +250,28 @@ impl Peer {
     }
 }
 
+/// Keeps the name of a pseudo-terminal that is gone from being given to a new one.
+pub struct Placeholder {
+    _terminals: Vec<OwnedFd>,
+}
+
+impl Placeholder {
+    pub fn take(name: &Path) -> Placeholder {
+        let mut terminals = Vec::new();
+        // The kernel gives the lowest number that is free.
+        for _ in 0..64 {
+            let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)
+                .expect("there are pseudo-terminals");
+            let its_name = ptsname(&terminal, Vec::new()).expect("it has a name");
+            terminals.push(terminal);
+            if its_name.to_string_lossy() == name.to_string_lossy() || name.exists() {
+                break;
+            }
+        }
+        Placeholder { _terminals: terminals }
+    }
+}
+
 impl Drop for Peer {
     fn drop(&mut self) {
         self.unplug();

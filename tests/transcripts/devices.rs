@@ -7,7 +7,7 @@ use busker::engine::device::{
 use busker::engine::profile::Library;
 use busker::engine::settings::{
     Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Layout, Line, Link, Manner, Mqtt, OnBrokerLoss, Parity,
-    Password, Recorder, Settings, Wanted,
+    Password, Recorder, Rs485, Settings, Wanted,
 };
 use busker::engine::time::Duration;
 use busker::engine::units::Release;
@@ -87,7 +87,7 @@ pub fn settings(header: &str) -> Settings {
                 Link::Tcp { host: "localhost".into(), port: 502 }
             } else {
                 let line = Line { baud: 19200, parity: Parity::Even, stop_bits: 1 };
-                Link::Serial { path: "/dev/null".into(), line }
+                Link::Serial { path: "/dev/null".into(), line, rs485: Rs485::Auto }
             },
             response_timeout: Duration::from_millis(500),
             gap: None,

@@ -6,7 +6,7 @@ use std::fmt::Write;
 use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Action, Bus, Command, Event, Saved, Severity};
 use busker::engine::memory::{Memories, Memory, Record};
-use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
+use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError, RequestsOfOthers};
 use busker::engine::profile::Library;
 use busker::engine::recorder::Entry;
 use busker::engine::request::{Decision, Desk};
@@ -58,6 +58,8 @@ struct Player {
     /// Holding register 0 is kept below holding register 1.
     clamps: bool,
     is_unsent: bool,
+    /// Another master's requests that were heard since the last reply.
+    others: RequestsOfOthers,
     /// While devices answer by themselves, requests are counted instead of written down.
     asked: BTreeMap<String, u32>,
 }
@@ -83,6 +85,7 @@ impl Player {
             silent: Vec::new(),
             clamps: false,
             is_unsent: false,
+            others: RequestsOfOthers::default(),
             asked: BTreeMap::new(),
         };
         player.take_actions();
@@ -116,6 +119,19 @@ impl Player {
             "setting" => self.change_setting(rest),
             "nothing-is-kept" => self.memories.unkept = Some("the card is full".into()),
             "clamps" => self.clamps = true,
+            // `another-asks 7 3`: unit 7, three times.
+            "another-asks" => {
+                let (unit, count) = rest.split_once(' ').expect("another-asks UNIT COUNT");
+                let (unit, count) = (unit.parse().expect("a unit"), count.parse().expect("a number"));
+                self.others = RequestsOfOthers { count, unit };
+            }
+            "tell-health" => {
+                let told = self.bus.summary(self.now);
+                self.write(&format!(
+                    "up {}, reason {:?}, collisions {}",
+                    told.up, told.reason, told.counters.collisions
+                ));
+            }
             // The request in flight waits for the line to be silent.
             "line-is-busy" => self.is_unsent = true,
             "line-is-silent" => self.is_unsent = false,
@@ -214,7 +230,11 @@ impl Player {
                     if self.answering {
                         *self.asked.entry(text).or_default() += 1;
                     } else {
-                        self.write(&format!("-> {text}   timeout {}", timeout.as_millis()));
+                        let later = match not_before > self.now {
+                            true => format!(" at {not_before}"),
+                            false => String::new(),
+                        };
+                        self.write(&format!("-> {text}   timeout {}{later}", timeout.as_millis()));
                     }
                     self.in_flight = Some((request, not_before.max(self.now), timeout));
                 }
@@ -264,7 +284,7 @@ impl Player {
         }
     }
 
-    /// `0001 0002`, `silence`, `checksum`, `wrong-frame`, `exception 2`, `written`, `names A, B`, `regular A, B`
+    /// `0001 0002`, `silence`, `checksum`, `collision`, `wrong-frame`, `exception 2`, `written`, `names A, B`, `regular A, B`
     /// (of a device that has more than the basic names, of which these are the next), `echo A537`,
     /// `server-id 0102`
     fn answer(&mut self, text: &str) {
@@ -274,6 +294,7 @@ impl Player {
         let result = match text.split_once(' ').unwrap_or((text, "")) {
             ("silence", _) => Err(RequestError::Timeout),
             ("checksum", _) => Err(RequestError::Checksum),
+            ("collision", _) => Err(RequestError::Collision),
             ("wrong-frame", _) => Err(RequestError::WrongFrame),
             ("exception", code) => Err(RequestError::Exception(code.parse().expect("a code"))),
             ("written", _) => Ok(Answer::Written),
@@ -351,7 +372,8 @@ impl Player {
 
     fn reply(&mut self, sent_at: Time, result: Result<Answer, RequestError>) {
         let heard = if result == Err(RequestError::Timeout) { None } else { Some(self.now) };
-        let discarded = Discarded::default();
+        let requests_of_others = std::mem::take(&mut self.others);
+        let discarded = Discarded { requests_of_others, ..Discarded::default() };
         let reply = Reply { result, sent_at, first_byte_at: heard, last_byte_at: heard, discarded };
         self.bus.handle(self.now, Event::Reply(reply));
     }

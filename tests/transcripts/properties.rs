@@ -62,6 +62,7 @@ enum End {
     Refused(u8),
     Silence,
     Checksum,
+    Collision,
 }
 
 fn happening() -> impl Strategy<Value = Happening> {
@@ -71,6 +72,7 @@ fn happening() -> impl Strategy<Value = Happening> {
         1 => (1u8..7).prop_map(|code| Happening::Ends(End::Refused(code))),
         1 => Just(Happening::Ends(End::Silence)),
         1 => Just(Happening::Ends(End::Checksum)),
+        1 => Just(Happening::Ends(End::Collision)),
         3 => (0..COMMANDS.len()).prop_map(Happening::Command),
         3 => (0..REQUESTS.len()).prop_map(Happening::Request),
         1 => (0usize..5).prop_map(Happening::Changed),
@@ -154,6 +156,7 @@ impl Observed {
             End::Refused(code) => Err(RequestError::Exception(*code)),
             End::Silence => Err(RequestError::Timeout),
             End::Checksum => Err(RequestError::Checksum),
+            End::Collision => Err(RequestError::Collision),
         };
         let (sent_at, heard) = (self.now, Some(self.now));
         let discarded = Discarded::default();

@@ -5,12 +5,14 @@ mod budget;
 mod feeding;
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use serde::Serialize;
 
 use super::configuration::{self, ConfigurationArgs, Loaded};
 use super::output::{self, Table};
 use super::{Failure, output::print_json};
+use crate::edge::link::adapter;
 use crate::engine;
 use crate::engine::settings::{Bus, DeviceSettings};
 use crate::engine::time::Duration;
@@ -70,6 +72,8 @@ fn checked(args: &Args) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
     Ok(loaded.and_then(|mut loaded| {
         let secret_faults = loaded.secret_faults();
         loaded.warnings.extend(secret_faults);
+        let stable_paths = loaded.stable_paths(Path::new(adapter::BY_ID));
+        loaded.warnings.extend(stable_paths);
         let faults = loaded.tls_faults();
         if faults.is_empty() { Ok(loaded) } else { Err(faults) }
     }))

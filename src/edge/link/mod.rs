@@ -1,5 +1,8 @@
 //! A link moves bytes: a serial port or a TCP connection, both as a descriptor that never blocks.
 
+pub mod adapter;
+pub mod check_up;
+pub mod driver;
 mod serial;
 mod tcp;
 
@@ -36,7 +39,9 @@ impl Link {
     /// would be right.
     pub fn open(settings: &settings::Link) -> Result<Link, Lost> {
         match settings {
-            settings::Link::Serial { path, line } => serial::Port::open(path, *line).map(Link::Serial),
+            settings::Link::Serial { path, line, rs485 } => {
+                serial::Port::open(path, *line, *rs485).map(Link::Serial)
+            }
             settings::Link::Tcp { host, port } | settings::Link::RtuOverTcp { host, port, .. } => {
                 tcp::connect(host, *port).map(Link::Tcp)
             }

@@ -1,13 +1,14 @@
 //! A serial port, raw: eight data bits, no flow control, no line discipline.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::path::Path;
 
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
 use rustix::io::Errno;
 use rustix::termios::{self, ControlModes, InputModes, OptionalActions, QueueSelector, SpecialCodeIndex};
 
-use crate::edge::link::Lost;
-use crate::engine::settings::{Line, Parity};
+use crate::edge::link::{Lost, adapter, driver};
+use crate::engine::settings::{Direction, Line, Parity, Rs485};
 
 /// An open port that no other program can open.
 #[derive(Debug)]
@@ -16,7 +17,7 @@ pub struct Port {
 }
 
 impl Port {
-    pub fn open(path: &str, line: Line) -> Result<Port, Lost> {
+    pub fn open(path: &str, line: Line, rs485: Rs485) -> Result<Port, Lost> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let descriptor = open(path, flags, Mode::empty()).map_err(|error| why_not_opened(path, error))?;
         // Two locks: programs that know only one of them are kept out as well.
@@ -27,7 +28,13 @@ impl Port {
             error => Lost(format!("`{path}` does not take {} baud: {error}", line.baud)),
         })?;
         termios::ioctl_tiocexcl(&descriptor).map_err(|error| why_not_opened(path, error))?;
-        Ok(Port { descriptor })
+        let port = Port { descriptor };
+        switch_direction(&port.descriptor, path, rs485)?;
+        // It only makes a reply be heard sooner; many drivers have nothing to hurry.
+        if let Err(error) = driver::set_low_latency(&port.descriptor) {
+            tracing::debug!("`{path}`: its driver knows no low latency: {error}");
+        }
+        Ok(port)
     }
 }
 
@@ -76,7 +83,40 @@ fn configure(descriptor: &OwnedFd, line: Line) -> Result<(), Errno> {
     termios::tcflush(descriptor, QueueSelector::IOFlush)
 }
 
-fn why_not_opened(path: &str, error: Errno) -> Lost {
+fn switch_direction(descriptor: &OwnedFd, path: &str, rs485: Rs485) -> Result<(), Lost> {
+    let wanted = match rs485 {
+        // Never switched on unasked: where RTS has another meaning, an adapter that switches by itself
+        // would be broken.
+        Rs485::Auto => return Ok(()),
+        Rs485::Kernel(direction) => Some(direction),
+        // A driver that cannot switch does not.
+        Rs485::None if !matches!(driver::direction(descriptor), Ok(Some(_))) => return Ok(()),
+        Rs485::None => None,
+    };
+    let refused = |why: String| {
+        let driver = adapter::driver(Path::new(path)).map_or(String::new(), |name| format!(" `{name}`"));
+        Lost(format!("`{path}`: its driver{driver} {why}"))
+    };
+    match driver::set_direction(descriptor, wanted) {
+        Ok(set) if set == wanted => Ok(()),
+        Ok(Some(set)) if wanted.is_some() => {
+            let Direction { rts_on_send, delay_before_send, delay_after_send } = set;
+            let on_send = if rts_on_send { "on" } else { "off" };
+            Err(refused(format!(
+                "takes `rs485` only in part: RTS is {on_send} on send, {} ms before and {} ms after it; \
+                 write that, or leave `rs485` out if the adapter switches by itself",
+                delay_before_send.as_millis(),
+                delay_after_send.as_millis(),
+            )))
+        }
+        Ok(_) | Err(Errno::NOTTY | Errno::INVAL) => Err(refused(
+            "cannot switch an RS485 transceiver; most adapters do it by themselves: leave `rs485` out".into(),
+        )),
+        Err(error) => Err(refused(format!("does not switch the RS485 transceiver: {error}"))),
+    }
+}
+
+pub(super) fn why_not_opened(path: &str, error: Errno) -> Lost {
     Lost(match error {
         Errno::NOENT | Errno::NODEV | Errno::NXIO | Errno::IO => {
             format!("`{path}` is not there; is the adapter plugged in?")

@@ -9,6 +9,7 @@ mod context;
 mod device;
 mod fetch;
 mod inbox;
+mod line;
 mod load;
 mod pause;
 mod recording;
@@ -45,8 +46,6 @@ use timekeeping::Timekeeping;
 pub use waiting::REPLACED;
 use waiting::{Target, WaitingCommands};
 
-/// After so many requests in a row that nobody answers, a TCP connection is made anew.
-const UNANSWERED_UNTIL_RENEWED: u32 = 5;
 /// What can happen to a bus.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
@@ -157,6 +156,7 @@ pub struct Bus {
     broker_up: bool,
     counters: Counters,
     times: Timekeeping,
+    line: line::Line,
     stopping: bool,
     recorder: Recorder,
     /// When something is to be stored next.
@@ -261,6 +261,7 @@ impl Bus {
             broker_up: true,
             counters,
             times: Timekeeping::default(),
+            line: line::Line::default(),
             stopping: false,
             recorder: Recorder::new(settings.recorder),
             record_due_at,
@@ -371,7 +372,7 @@ impl Bus {
     /// The same without points, which are most of it.
     pub fn summary(&self, now: Time) -> BusReport {
         let reason = match &self.link_state {
-            LinkState::Up | LinkState::Renewing => None,
+            LinkState::Up | LinkState::Renewing => self.line.trouble(now),
             LinkState::Down { reason, .. } => Some(reason.clone().unwrap_or("not yet open".into())),
             LinkState::Paused { reason } => Some(reason.clone()),
         };
@@ -458,19 +459,10 @@ impl Bus {
             self.unanswered =
                 if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
         }
+        self.look_for_others(&reply);
+        let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         self.request_ended(in_flight, reply.result);
         self.renew_silent_connection();
-    }
-
-    /// A serial server may accept a connection and never pass anything on; only a new one helps. A
-    /// serial port has no such state.
-    fn renew_silent_connection(&mut self) {
-        let is_connection = !matches!(self.link, Link::Serial { .. });
-        if is_connection && self.unanswered >= UNANSWERED_UNTIL_RENEWED && self.link_state == LinkState::Up {
-            self.unanswered = 0;
-            self.link_state = LinkState::Renewing;
-            self.context.actions.push_back(Action::Reopen { after: Duration::ZERO });
-        }
     }
 
     fn request_ended(&mut self, in_flight: InFlight, result: Result<Answer, RequestError>) {

@@ -62,6 +62,7 @@ impl Bus {
             Err(RequestError::Timeout) if is_missed => "no answer",
             Err(RequestError::Checksum) => "a damaged answer",
             Err(RequestError::WrongFrame) => "an answer that does not fit",
+            Err(RequestError::Collision) => "a collision",
             _ if reply.discarded.checksum_errors > 0 => "a damaged frame",
             _ if reply.discarded.late_replies > 0 => "a late reply",
             _ if reply.discarded.foreign_frames > 0 => "a frame that nobody asked for",

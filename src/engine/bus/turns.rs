@@ -189,7 +189,7 @@ impl Bus {
             before: Some(before),
             gives_way: is_poll,
         });
-        self.context.actions.push_back(Action::Send { request, not_before, timeout });
+        self.ask(request, not_before, timeout);
     }
 
     /// Asks a unit that is no device of this gateway.
@@ -206,7 +206,7 @@ impl Bus {
             out_of_turn: false,
             gives_way: false,
         });
-        self.context.actions.push_back(Action::Send { request, not_before: now, timeout });
+        self.ask(request, now, timeout);
     }
 }
 

@@ -12,7 +12,7 @@ use crate::engine::configuration::words::{
 };
 use crate::engine::device::Poll;
 use crate::engine::profile::file::{Intervals, Point, Presentation, Thing, Wire};
-use crate::engine::settings::{Layout, OnBrokerLoss, Parity};
+use crate::engine::settings::{self, Layout, OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
 use crate::engine::value::Decimal;
@@ -167,6 +167,43 @@ record! {
         response_timeout: Part<At<Duration>> = Part::of(At::nowhere(Duration::from_millis(500))),
         /// Silence before each request; 3.5 characters unless said.
         gap: Option<Part<At<Duration>>>,
+        /// Who switches the RS485 transceiver of a serial port between sending and listening: `auto` leaves
+        /// it to the adapter, or to the kernel where the device tree says so; `kernel` lets the kernel do it by
+        /// RTS, with `{delay_before_send: 1ms}` after a time; `none` keeps the kernel from it.
+        rs485: Option<Part<Rs485>>,
+    }
+}
+
+/// Who switches a transceiver: `kernel`, or the longer form with its delays.
+#[derive(Clone, Debug)]
+pub enum Rs485 {
+    Word(At<settings::Rs485>),
+    Kernel(KernelRs485),
+}
+
+record! {
+    /// The kernel switches the transceiver by the port's RTS.
+    pub struct KernelRs485 {
+        /// Whether RTS is on, and not off, while a frame is sent.
+        rts_on_send: bool = true,
+        /// From the switch to the first bit: up to 100ms, in whole milliseconds.
+        delay_before_send: At<Duration> = At::nowhere(Duration::ZERO),
+        /// From the last bit to the switch back: up to 100ms, in whole milliseconds.
+        delay_after_send: At<Duration> = At::nowhere(Duration::ZERO),
+    }
+}
+
+impl Read for Rs485 {
+    fn read(node: &Node, faults: &mut Faults) -> Option<Rs485> {
+        match node.content {
+            Content::Map(_) => KernelRs485::read(node, faults).map(Rs485::Kernel),
+            Content::Scalar { .. } | Content::List(_) => At::read(node, faults).map(Rs485::Word),
+        }
+    }
+
+    fn schema(definitions: &mut Definitions) -> Json {
+        let short = <settings::Rs485 as Scalar>::schema();
+        json!({"anyOf": [short, KernelRs485::schema(definitions)]})
     }
 }
 

@@ -1,10 +1,11 @@
 //! A configuration file to [`Settings`], or to every fault in it.
 //!
-//! [`file`] is the shape, `words` its scalars; here, in `broker`, in `wishes` and in `wanted` are the rules beyond
+//! [`file`] is the shape, `words` its scalars; here, in `broker`, `links`, `wishes` and `wanted` are the rules beyond
 //! the shape.
 
 mod broker;
 pub mod file;
+mod links;
 mod secrets;
 mod wanted;
 mod wishes;
@@ -17,13 +18,12 @@ use std::sync::Arc;
 
 use crate::engine::address::Span;
 use crate::engine::configuration::file::Configuration;
-use crate::engine::configuration::words::{HostPort, Listen, Name, Part, Unit};
+use crate::engine::configuration::words::{Listen, Name, Part, Unit};
 use crate::engine::device::Device;
 use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
-    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Level, Line, Link, Parity, Password, Recorder,
-    Settings, Wanted,
+    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Level, Password, Recorder, Settings, Wanted,
 };
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
@@ -239,102 +239,6 @@ impl Resolver<'_> {
             self.warnings.add(&file.place, "no device is configured; devices stand under `devices`");
         }
         buses
-    }
-
-    fn serial_port(&mut self, port: &At<String>, others: &[&At<String>]) {
-        let path = port.as_str();
-        if !path.starts_with('/') {
-            self.faults.add(
-                &port.place,
-                format!("`{path}` is no path of a serial port; expected one like `/dev/serial/by-id/usb-…`"),
-            );
-        } else if path.starts_with("/dev/ttyUSB") || path.starts_with("/dev/ttyACM") {
-            self.warnings.add(
-                &port.place,
-                format!(
-                    "`{path}` may be another adapter after the next start; \
-                     use its path under `/dev/serial/by-id/`"
-                ),
-            );
-        }
-        if let Some(other) = others.iter().find(|other| other.value == port.value) {
-            let line = other.place.line();
-            self.faults.add(
-                &port.place,
-                format!("`{path}` is the port of the bus in line {line} already; a port serves one bus"),
-            );
-        }
-    }
-
-    fn link(&mut self, name: &At<Name>, bus: &file::Bus) -> Option<Link> {
-        let links = [
-            ("serial", bus.serial.as_ref().map(|link| link.get().map(|at| &at.place))),
-            ("tcp", bus.tcp.as_ref().map(|link| link.get().map(|at| &at.place))),
-            ("rtu_over_tcp", bus.rtu_over_tcp.as_ref().map(|link| link.get().map(|at| &at.place))),
-        ];
-        let mut given = links.into_iter().filter_map(|(key, link)| Some((key, link?)));
-        match given.next() {
-            None => self.faults.add(
-                &name.place,
-                format!(
-                    "the bus `{}` leads nowhere; expected one of `serial`, `tcp` or `rtu_over_tcp`",
-                    name.0
-                ),
-            ),
-            Some((first, _)) => {
-                for (other, place) in given {
-                    self.faults.add(
-                        place.unwrap_or(&name.place),
-                        format!("`{other}` stands beside `{first}`; a bus has one link, keep one of them"),
-                    );
-                }
-            }
-        }
-        let line = Line {
-            baud: read_part(&bus.baud).map_or(19_200, |baud| baud.0),
-            parity: read_part(&bus.parity).map_or(Parity::Even, |parity| parity.value),
-            stop_bits: read_part(&bus.stop_bits).map_or(1, |stop_bits| stop_bits.0),
-        };
-        match (&bus.serial, &bus.tcp, &bus.rtu_over_tcp) {
-            (Some(path), None, None) => Some(Link::Serial { path: path.get()?.value.clone(), line }),
-            (None, Some(address), None) => {
-                self.no_line(bus);
-                let HostPort { host, port } = self.address(address.get()?);
-                Some(Link::Tcp { host, port })
-            }
-            (None, None, Some(address)) => {
-                let HostPort { host, port } = self.address(address.get()?);
-                Some(Link::RtuOverTcp { host, port, line })
-            }
-            _ => None,
-        }
-    }
-
-    /// Notes the keys of a serial line on a bus that has none.
-    fn no_line(&mut self, bus: &file::Bus) {
-        let keys = [
-            ("baud", read_part(&bus.baud).map(|baud| &baud.place)),
-            ("parity", read_part(&bus.parity).map(|parity| &parity.place)),
-            ("stop_bits", read_part(&bus.stop_bits).map(|stop_bits| &stop_bits.place)),
-        ];
-        for (key, place) in keys {
-            if let Some(place) = place {
-                self.faults.add(
-                    place,
-                    format!(
-                        "Modbus TCP has no `{key}`; remove it, or write `rtu_over_tcp` \
-                         if a serial server passes the frames of a line through"
-                    ),
-                );
-            }
-        }
-    }
-
-    fn address(&mut self, address: &At<HostPort>) -> HostPort {
-        if address.port == 0 {
-            self.faults.add(&address.place, "nothing listens on port 0; Modbus TCP is usually on 502");
-        }
-        address.value.clone()
     }
 
     fn devices(&mut self, file: &Configuration) -> Vec<DeviceSettings> {

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::engine::codec;
 use crate::engine::device::Poll;
-use crate::engine::settings::{ClientCertificate, OnBrokerLoss, Tls};
+use crate::engine::settings::{ClientCertificate, Direction, Line, Link, OnBrokerLoss, Parity, Rs485, Tls};
 use crate::engine::value::Decimal;
 
 /// A device without cases and one that decides how its reading is understood.
@@ -84,6 +84,24 @@ devices:
 }
 
 #[test]
+fn the_kernel_switches_a_transceiver_only_where_it_is_told_to() {
+    let usual = Direction::default();
+    let slow = Direction { rts_on_send: false, delay_before_send: Duration::from_millis(2), ..usual };
+    for (said, expected) in [
+        ("", Rs485::Auto),
+        (", rs485: auto", Rs485::Auto),
+        (", rs485: none", Rs485::None),
+        (", rs485: kernel", Rs485::Kernel(usual)),
+        (", rs485: {}", Rs485::Kernel(usual)),
+        (", rs485: {rts_on_send: false, delay_before_send: 2ms}", Rs485::Kernel(slow)),
+    ] {
+        let (settings, _) = good(&format!("buses: {{shed: {{serial: /dev/ttyAMA0{said}}}}}"));
+        let Link::Serial { rs485, .. } = settings.buses[0].link else { panic!("a serial port") };
+        assert_eq!(rs485, expected, "{said}");
+    }
+}
+
+#[test]
 fn every_key_has_its_place() {
     let (settings, warnings) = good(
         "
@@ -121,7 +139,10 @@ devices:
     assert_eq!(settings.on_broker_loss, OnBrokerLoss::StopFeeding);
     assert_eq!(settings.republish, Duration::from_secs(3600));
     let line = Line { baud: 9600, parity: Parity::Odd, stop_bits: 2 };
-    assert_eq!(settings.buses[0].link, Link::Serial { path: "/dev/ttyUSB0".into(), line });
+    assert_eq!(
+        settings.buses[0].link,
+        Link::Serial { path: "/dev/ttyUSB0".into(), line, rs485: Rs485::Auto }
+    );
     assert_eq!(settings.buses[0].gap, Some(Duration::from_millis(5)));
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
     assert_eq!(settings.buses[1].link, Link::RtuOverTcp { host: "serial-server".into(), port: 4196, line });

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use crate::engine::settings::{self, Layout, OnBrokerLoss, Parity};
+use crate::engine::settings::{self, Direction, Layout, OnBrokerLoss, Parity, Rs485};
 use crate::engine::units::Release;
 use crate::engine::yaml::{Definitions, Faults, Json, Node, Read, Scalar, choices};
 
@@ -11,6 +11,12 @@ choices! { "a parity", Parity { "none" => Parity::None, "even" => Parity::Even, 
 choices! { "a rule for a lost broker", OnBrokerLoss {
     "keep" => OnBrokerLoss::Keep,
     "stop_feeding" => OnBrokerLoss::StopFeeding,
+} }
+
+choices! { "a way to switch an RS485 transceiver", Rs485 {
+    "auto" => Rs485::Auto,
+    "kernel" => Rs485::Kernel(Direction::default()),
+    "none" => Rs485::None,
 } }
 
 /// The name of a device, a bus or a point.

@@ -26,9 +26,11 @@ impl Guard {
     /// The guard for `link`. `gap`: silence before each RTU request, `None`: the line's own.
     pub fn new(link: &Link, gap: Option<Duration>) -> Guard {
         match link {
-            Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } => {
-                Guard::Rtu(rtu::Guard::new(*line, gap, None))
+            Link::Serial { line, rs485, .. } => {
+                let guard = rtu::Guard::new(*line, gap, None);
+                Guard::Rtu(guard.with_delay_before_send(rs485.delay_before_send()))
             }
+            Link::RtuOverTcp { line, .. } => Guard::Rtu(rtu::Guard::new(*line, gap, None)),
             Link::Tcp { .. } => Guard::Tcp(tcp::Guard::new()),
         }
     }

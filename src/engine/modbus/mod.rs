@@ -143,6 +143,8 @@ pub enum RequestError {
     /// A whole and valid frame came, and nothing better: another unit's, another function's, a wrong
     /// length, a wrong echo.
     WrongFrame,
+    /// On a line that returns what we send, something else came back: another spoke at the same time.
+    Collision,
     /// The port or the connection broke.
     Link(String),
     /// Nothing was sent, because no frame can ask this, and why: a broadcast read, 200 registers.
@@ -156,6 +158,7 @@ impl fmt::Display for RequestError {
             RequestError::Timeout => write!(f, "no answer in time"),
             RequestError::Checksum => write!(f, "checksum error"),
             RequestError::WrongFrame => write!(f, "an answer that does not fit the request"),
+            RequestError::Collision => write!(f, "collision: another spoke on the line at the same time"),
             RequestError::Link(reason) => write!(f, "link: {reason}"),
             RequestError::Impossible(reason) => write!(f, "cannot be asked: {reason}"),
         }
@@ -222,4 +225,13 @@ pub struct Discarded {
     pub echoes: u32,
     /// Frames with a wrong checksum.
     pub checksum_errors: u32,
+    /// Whole requests that we did not send: another master's.
+    pub requests_of_others: RequestsOfOthers,
+}
+
+/// How many requests of another master were heard, and to which unit the last one was.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RequestsOfOthers {
+    pub count: u32,
+    pub unit: u8,
 }

@@ -135,6 +135,20 @@ pub fn foreign_lengths(pdu: &[u8]) -> impl Iterator<Item = usize> {
     lengths.into_iter().flatten().filter(|length| *length <= LENGTH_MAX)
 }
 
+/// Whether `pdu`, as long as one of [`foreign_lengths`], is a master's request. Of functions 5, 6 and 8 the
+/// confirmation looks the same, and is taken for the request.
+pub fn is_request(pdu: &[u8]) -> bool {
+    match pdu {
+        // An answer is as long as its second byte says.
+        [1..=4, count, ..] => pdu.len() == 5 && *count != 3,
+        [5 | 6 | 8, ..] => true,
+        [15 | 16, ..] => pdu.len() > 5,
+        [17] => true,
+        [43, MEI_IDENTIFICATION, ..] => pdu.len() == 4,
+        _ => false,
+    }
+}
+
 const EXCEPTION: u8 = 0x80;
 
 /// The MODBUS Encapsulated Interface type of Read Device Identification (6.21).

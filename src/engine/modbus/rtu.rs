@@ -15,6 +15,8 @@
 //!   from a good one.
 //! * Some adapters return our own bytes. Such an echo is skipped and remembered: the replies to
 //!   functions 5, 6 and 8 look like it.
+//! * Where the line is known to do so, what comes back must be what was sent. If it is not, another spoke
+//!   at the same time: no reply to that request is believed, it may be the other's.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +24,7 @@ use crate::engine::modbus::pdu;
 use crate::engine::modbus::rtu_bytes::{
     Beginning, Unanswered, beginning, expected_length, frame, late_reply, sort,
 };
-use crate::engine::modbus::{Answer, Discarded, Reply, Request, RequestError};
+use crate::engine::modbus::{Answer, Discarded, Reply, Request, RequestError, RequestsOfOthers};
 use crate::engine::settings::Line;
 use crate::engine::time::{Duration, Time};
 
@@ -42,6 +44,9 @@ const LATE_MAX: Duration = Duration::from_secs(10);
 const FRAME_MAX: u32 = 256;
 /// What is heard beyond this without a frame in it is noise.
 const HEARD_MAX: usize = 2048;
+/// After so many requests in a row that did not come back the adapter may be another one, on which noise
+/// before a reply is not a damaged echo.
+const ECHOES_MISSED_MAX: u32 = 3;
 /// As many bytes without any frame are a damaged reply rather than noise.
 const DAMAGED_MIN: u32 = 4;
 
@@ -52,6 +57,8 @@ const DAMAGED_MIN: u32 = 4;
 pub struct Guard {
     line: Line,
     gap: Duration,
+    /// From handing a frame over until its first bit: a transceiver is switched.
+    delay_before_send: Duration,
     /// `None`: as long as the request's own timeout.
     quarantine: Option<Duration>,
     state: State,
@@ -60,6 +67,8 @@ pub struct Guard {
     /// When each byte of `heard` came.
     heard_at: Vec<Time>,
     echo: Echo,
+    /// Requests in a row that did not come back although the line returns what we send.
+    echoes_missed: u32,
     /// When the last byte was on the wire, in either direction.
     busy_until: Option<Time>,
     quarantine_until: Option<Time>,
@@ -105,24 +114,32 @@ struct Found {
 }
 
 impl Guard {
-    /// `gap`: silence before each request, `None`: the line's own. `quarantine`: how long the line
+    /// `gap`: silence before each request, `None`: the line's own; never less than the last byte's stop bits
+    /// take. `quarantine`: how long the line
     /// stays silent after a request timed out, `None`: as long as that request's timeout.
     pub fn new(line: Line, gap: Option<Duration>, quarantine: Option<Duration>) -> Guard {
         Guard {
             line,
-            gap: whole_micros(gap.unwrap_or_else(|| line.frame_gap())),
+            gap: whole_micros(gap.unwrap_or_else(|| line.frame_gap()).max(line.stop())),
+            delay_before_send: Duration::ZERO,
             quarantine,
             state: State::Idle,
             frame: Vec::new(),
             heard: Vec::new(),
             heard_at: Vec::new(),
             echo: Echo::Unknown,
+            echoes_missed: 0,
             busy_until: None,
             quarantine_until: None,
             unanswered: Vec::new(),
             lateness: BTreeMap::new(),
             discarded: Discarded::default(),
         }
+    }
+
+    /// The same line, on which a frame waits so long before its first bit.
+    pub fn with_delay_before_send(self, delay_before_send: Duration) -> Guard {
+        Guard { delay_before_send, ..self }
     }
 
     /// Takes the next request. A reply at once means that it cannot be asked on this line.
@@ -165,7 +182,7 @@ impl Guard {
         };
         self.drop_strays(self.heard.len());
         self.quarantine_until = None;
-        let transmitted_at = now + self.line.characters(self.frame.len() as u32);
+        let transmitted_at = now + self.delay_before_send + self.line.characters(self.frame.len() as u32);
         self.busy_until = Some(transmitted_at);
         let wait = if request.unit == 0 { TURNAROUND } else { timeout };
         let deadline = transmitted_at + wait;
@@ -191,7 +208,7 @@ impl Guard {
             State::Waiting(waiting) if waiting.request.unit != 0 => {
                 let waiting = waiting.clone();
                 let found = self.trusted_reply(&waiting, false)?;
-                Some(self.answered(waiting, found))
+                Some(self.replied(waiting, found))
             }
             State::Waiting(_) => None,
             State::Idle | State::Begun { .. } => {
@@ -218,15 +235,18 @@ impl Guard {
     pub fn wake(&mut self, now: Time) -> Option<Reply> {
         let State::Waiting(waiting) = &mut self.state else { return None };
         if waiting.request.unit == 0 {
-            let (sent_at, over) = (waiting.sent_at, now >= waiting.deadline);
-            return over.then(|| self.obeyed(sent_at));
+            let waiting = waiting.clone();
+            return (now >= waiting.deadline).then(|| self.obeyed(waiting));
         }
         let mut waiting = waiting.clone();
         if self.silent_at(&waiting).is_some_and(|silent| now >= silent) {
             waiting.looked_at = self.heard.len();
             self.state = State::Waiting(waiting.clone());
             if let Some(found) = self.trusted_reply(&waiting, true) {
-                return Some(self.answered(waiting, found));
+                return Some(self.replied(waiting, found));
+            }
+            if self.has_collided(&waiting, self.heard.len()) {
+                return Some(self.collided(waiting));
             }
             if let Some(reply) = self.damaged_reply(&waiting) {
                 return Some(reply);
@@ -236,7 +256,8 @@ impl Guard {
             return None;
         }
         Some(match self.only_reply(&waiting) {
-            Some(found) => self.answered(waiting, found),
+            Some(found) => self.replied(waiting, found),
+            None if self.has_collided(&waiting, self.heard.len()) => self.collided(waiting),
             None => self.unanswered(now, waiting),
         })
     }
@@ -332,6 +353,38 @@ impl Guard {
         waiting.deadline.max(silent.min(latest))
     }
 
+    /// Whether the first `count` bytes heard should hold our own request, and hold something else. Where
+    /// nothing was heard, the line may no longer return what we send.
+    fn has_collided(&self, waiting: &Waiting, count: usize) -> bool {
+        let heard = &self.heard[..count];
+        self.echo == Echo::Yes
+            && !heard.is_empty()
+            && sort(heard, &self.frame, Some(&waiting.request), &self.unanswered).discarded.echoes == 0
+    }
+
+    /// Our request was damaged on the line, and what was heard besides may be anybody's. What may still
+    /// come is waited for as after a timeout.
+    fn collided(&mut self, waiting: Waiting) -> Reply {
+        let sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
+        // What remained of our request is neither noise nor a damaged reply.
+        self.count(Discarded { noise_bytes: 0, checksum_errors: 0, ..sorted.discarded });
+        self.forget(&sorted.late);
+        self.miss_echo();
+        self.quarantine_until = Some(waiting.deadline);
+        self.remember(&waiting, self.heard_at.last().copied().unwrap_or(waiting.deadline));
+        self.clear(self.heard.len());
+        self.state = State::Idle;
+        Reply::new(Err(RequestError::Collision), waiting.sent_at, None, &mut self.discarded)
+    }
+
+    fn miss_echo(&mut self) {
+        self.echoes_missed += 1;
+        if self.echoes_missed >= ECHOES_MISSED_MAX {
+            self.echo = Echo::Unknown;
+            self.echoes_missed = 0;
+        }
+    }
+
     /// The error that can be told before the deadline: a reply came, but damaged.
     fn damaged_reply(&mut self, waiting: &Waiting) -> Option<Reply> {
         let sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
@@ -386,6 +439,10 @@ impl Guard {
         };
         if heard.echoes > 0 && !self.reply_looks_like_echo(&waiting) {
             self.echo = Echo::Yes;
+            self.echoes_missed = 0;
+        }
+        if heard.echoes == 0 && self.echo == Echo::Yes {
+            self.miss_echo();
         }
         self.count(sorted.discarded);
         self.forget(&sorted.late);
@@ -396,11 +453,20 @@ impl Guard {
         Reply::new(Err(error), waiting.sent_at, first.zip(last), &mut self.discarded)
     }
 
+    fn replied(&mut self, waiting: Waiting, found: Found) -> Reply {
+        if self.has_collided(&waiting, found.start) {
+            self.collided(waiting)
+        } else {
+            self.answered(waiting, found)
+        }
+    }
+
     fn answered(&mut self, waiting: Waiting, found: Found) -> Reply {
         let sorted = sort(&self.heard[..found.start], &self.frame, Some(&waiting.request), &self.unanswered);
         let too_late_for_an_echo = self.heard_at[found.end - 1] > waiting.transmitted_at + SILENCE;
         if sorted.discarded.echoes > 0 {
             self.echo = Echo::Yes;
+            self.echoes_missed = 0;
         } else if !self.reply_looks_like_echo(&waiting) || too_late_for_an_echo {
             self.echo = Echo::No;
         }
@@ -427,7 +493,11 @@ impl Guard {
     }
 
     /// A broadcast has had its time.
-    fn obeyed(&mut self, sent_at: Time) -> Reply {
+    fn obeyed(&mut self, waiting: Waiting) -> Reply {
+        if self.has_collided(&waiting, self.heard.len()) {
+            return self.collided(waiting);
+        }
+        let sent_at = waiting.sent_at;
         let sorted = sort(&self.heard, &self.frame, None, &self.unanswered);
         // Nobody replies, so a copy of the request can only be an echo.
         self.echo = if sorted.discarded.echoes > 0 { Echo::Yes } else { Echo::No };
@@ -489,6 +559,11 @@ impl Guard {
         sum.foreign_frames += more.foreign_frames;
         sum.echoes += more.echoes;
         sum.checksum_errors += more.checksum_errors;
+        let others = more.requests_of_others;
+        if others.count > 0 {
+            let count = sum.requests_of_others.count + others.count;
+            sum.requests_of_others = RequestsOfOthers { count, ..others };
+        }
     }
 }
 

@@ -86,6 +86,8 @@ pub fn sort(bytes: &[u8], own: &[u8], request: Option<&Request>, unanswered: &[U
     let mut at = 0;
     // Where the run of bytes that belong to no frame began to look like a reply.
     let mut damaged_from = None;
+    // Another master's request, whose confirmation may follow.
+    let mut before = None;
     while at < bytes.len() {
         let rest = &bytes[at..];
         let length = if !own.is_empty() && rest.starts_with(own) {
@@ -97,6 +99,15 @@ pub fn sort(bytes: &[u8], own: &[u8], request: Option<&Request>, unanswered: &[U
             length
         } else if let Some(length) = foreign_frame(rest) {
             sorted.discarded.foreign_frames += 1;
+            let frame = &rest[..length];
+            // A confirmation that looks like its request follows it.
+            if pdu::is_request(&frame[1..length - 2]) && before != Some(frame) {
+                let others = &mut sorted.discarded.requests_of_others;
+                (others.count, others.unit) = (others.count + 1, frame[0]);
+                before = Some(frame);
+            } else {
+                before = None;
+            }
             length
         } else {
             if damaged_from.is_none() && request.is_some_and(|request| looks_like_reply(rest, request)) {

@@ -115,7 +115,7 @@ impl Scene {
 /// What a guard counts, in the order of `Discarded`: noise bytes, late, foreign, echoes, checksum errors.
 fn counts(counts: [u32; 5]) -> Discarded {
     let [noise_bytes, late_replies, foreign_frames, echoes, checksum_errors] = counts;
-    Discarded { noise_bytes, late_replies, foreign_frames, echoes, checksum_errors }
+    Discarded { noise_bytes, late_replies, foreign_frames, echoes, checksum_errors, ..Discarded::default() }
 }
 
 #[test]
@@ -209,6 +209,16 @@ fn the_timeout_counts_from_the_requests_last_bit_and_waits_while_bytes_flow() {
 }
 
 #[test]
+fn a_frame_that_waits_for_its_transceiver_is_given_that_time_too() {
+    let delay = Duration::from_millis(40);
+    let mut scene = Scene::new();
+    scene.guard = Guard::new(LINE, None, None).with_delay_before_send(delay);
+    let (reply, after) = scene.ask(&two_inputs()).reply();
+    assert_eq!(reply.result, Err(RequestError::Timeout));
+    assert_eq!(after, Time(0) + delay + TIMEOUT + LINE.characters(8) - Time(0));
+}
+
+#[test]
 fn before_each_request_the_line_is_silent() {
     let mut scene = Scene::without_echo();
     let answered_at = scene.now;
@@ -225,8 +235,23 @@ fn before_each_request_the_line_is_silent() {
         scene.wait(1).hears(vec![0x55]);
         assert!(scene.now - begun_at < Duration::from_millis(1100));
     }
-    let wide = Guard::new(LINE, Some(Duration::from_millis(9)), None);
-    assert_eq!(wide.gap, Duration::from_millis(9));
+}
+
+#[test]
+fn no_gap_is_shorter_than_the_stop_bits_of_the_byte_before() {
+    let two = Line { stop_bits: 2, parity: Parity::None, baud: 300 };
+    for (what, line, gap, micros) in [
+        ("a wide one", LINE, Some(9_000), 9_000),
+        ("a narrow one", LINE, Some(100), 100),
+        ("none, as long as it lasts", LINE, Some(0), 53),
+        ("two stop bits on a slow line", two, Some(100), 6_667),
+        ("3.5 characters", LINE, None, 2_006),
+        ("3.5 characters with two stop bits", two, None, 128_334),
+        ("a fast line", Line { baud: 115_200, ..LINE }, None, 1_750),
+    ] {
+        let guard = Guard::new(line, gap.map(Duration::from_micros), None);
+        assert_eq!(guard.gap, Duration::from_micros(micros), "{what}");
+    }
 }
 
 #[test]
@@ -362,6 +387,104 @@ fn an_echo_is_skipped_and_no_write_is_confirmed_by_it() {
     let mut scene = Scene::without_echo();
     scene.ask(&set_relay()).wait(2).hears(relay);
     assert_eq!(scene.expect("no echo", Ok(Answer::Written)), counts([0; 5]));
+}
+
+/// A line that is known to return what we send.
+fn with_echo() -> Scene {
+    let mut scene = Scene::new();
+    let echo = frame(1, &pdu::encode(&two_inputs().call).expect("a request that can be asked"));
+    scene.ask(&two_inputs()).hears(echo).wait(9).hears(framed("01 04 04 00 07 00 08"));
+    scene.expect("the first reading", words(&[7, 8]));
+    scene
+}
+
+#[test]
+fn where_the_line_returns_what_we_send_something_else_is_a_collision_and_nobody_is_believed() {
+    let echo = frame(1, &pdu::encode(&two_inputs().call).expect("a request that can be asked"));
+    let mut damaged = echo.clone();
+    damaged[3] ^= 0x41;
+    let reply = framed("01 04 04 00 63 00 63");
+    let other = framed("01 04 00 64 00 02");
+    for (what, request, bytes) in [
+        ("a damaged echo", two_inputs(), damaged.clone()),
+        ("half an echo", two_inputs(), echo[..5].to_vec()),
+        ("a damaged echo and a reply that fits", two_inputs(), [damaged.clone(), reply.clone()].concat()),
+        ("another's request instead", two_inputs(), other.clone()),
+        ("another's request and its reply", two_inputs(), [other, reply.clone()].concat()),
+        ("a damaged echo of a write", set_relay(), damaged),
+        ("a broadcast", Request::new(0, Call::WriteRegister { address: 5, word: 1 }), raw("00 06 00")),
+    ] {
+        let mut scene = with_echo();
+        scene.ask(&request).wait(4).hears(bytes);
+        let counted = scene.expect(what, Err(RequestError::Collision));
+        let (noise, damaged) = (counted.noise_bytes, counted.checksum_errors);
+        assert_eq!((noise, damaged), (0, 0), "{what}: it is counted as a collision");
+        assert!(scene.now - scene.sent_at <= Duration::from_millis(150), "{what}: told at once");
+        // A reply that still comes is late.
+        scene.wait(60).hears(reply.clone());
+        scene.ask(&two_inputs()).hears(echo.clone()).wait(9).hears(framed("01 04 04 00 2A 00 2B"));
+        scene.expect(what, words(&[42, 43]));
+    }
+
+    // Noise beside a whole echo is only noise.
+    for bytes in [[vec![0], echo.clone()].concat(), [echo.clone(), vec![0]].concat()] {
+        let mut scene = with_echo();
+        scene.ask(&two_inputs()).wait(4).hears([bytes, framed("01 04 04 00 01 00 02")].concat());
+        assert_eq!(scene.expect("noise", words(&[1, 2])), counts([1, 0, 0, 1, 0]));
+    }
+}
+
+#[test]
+fn a_line_that_no_longer_returns_what_we_send_is_learnt_anew() {
+    // The reply stands alone: so the echo is gone.
+    let mut scene = with_echo();
+    scene.expect_the_next_reading_right("another adapter");
+    assert_eq!(scene.guard.echo, Echo::No);
+
+    // Noise before each reply looks like a damaged echo, but not for ever.
+    let mut scene = with_echo();
+    for _ in 0..ECHOES_MISSED_MAX {
+        scene.ask(&two_inputs()).wait(4).hears(vec![0]).wait(4).hears(framed("01 04 04 00 01 00 02"));
+        scene.expect("noise first", Err(RequestError::Collision));
+        scene.wait(500);
+    }
+    scene.ask(&two_inputs()).wait(4).hears(vec![0]).wait(4).hears(framed("01 04 04 00 01 00 02"));
+    scene.expect("noise first", words(&[1, 2]));
+    assert_eq!(scene.guard.echo, Echo::No);
+
+    // An echo now and then is enough to keep it known.
+    let mut scene = with_echo();
+    let echo = scene.guard.frame().to_vec();
+    for round in 0..9 {
+        scene.ask(&two_inputs()).wait(4).hears(if round % 2 == 0 { vec![0] } else { echo.clone() });
+        let _ = scene.reply();
+    }
+    assert_eq!(scene.guard.echo, Echo::Yes);
+}
+
+#[test]
+fn another_masters_requests_are_counted_with_the_unit_they_were_to() {
+    let relay = "03 05 00 00 FF 00";
+    for (what, frames, count, unit) in [
+        ("a read and its reply", &["07 03 00 00 00 02", "07 03 04 00 01 00 02"][..], 1, 7),
+        ("a reply alone", &["07 03 04 00 01 00 02"], 0, 0),
+        ("an exception", &["07 83 02"], 0, 0),
+        ("24 coils, as long as a request", &["07 01 03 FF FF FF"], 0, 0),
+        ("a write and its confirmation", &[relay, relay], 1, 3),
+        ("the same write twice", &[relay, relay, relay, relay], 2, 3),
+        ("two writes", &[relay, relay, "03 06 00 01 00 02", "03 06 00 01 00 02"], 2, 3),
+        ("many registers", &["09 10 00 01 00 01 02 00 05", "09 10 00 01 00 01"], 1, 9),
+        ("a broadcast", &["00 06 00 01 00 02"], 1, 0),
+    ] {
+        let mut scene = Scene::without_echo();
+        for frame in frames {
+            scene.wait(20).hears(framed(frame));
+        }
+        scene.wait(20).ask(&two_inputs()).wait(5).hears(framed("01 04 04 00 2A 00 2B"));
+        let counted = scene.expect(what, words(&[42, 43]));
+        assert_eq!(counted.requests_of_others, RequestsOfOthers { count, unit }, "{what}");
+        assert_eq!(counted.foreign_frames as usize, frames.len(), "{what}");
+    }
 }
 
 #[test]

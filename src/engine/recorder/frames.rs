@@ -96,6 +96,7 @@ impl Reader {
             End::Timeout => Some("no answer in time"),
             End::Checksum => Some("no answer but a damaged one"),
             End::WrongFrame => Some("no answer that fits"),
+            End::Collision => Some("another spoke at the same time"),
             End::Lost => Some("the link broke before the answer"),
         };
         let request = self.request_at.and_then(|at| self.frames.get_mut(at)).filter(|_| self.is_open);
@@ -242,7 +243,7 @@ mod tests {
     use super::*;
     use crate::engine::modbus::rtu_bytes;
     use crate::engine::recorder::Tape;
-    use crate::engine::settings::{Line, Link, Parity};
+    use crate::engine::settings::{Line, Link, Parity, Rs485};
 
     fn bytes(hex: &str) -> Vec<u8> {
         let digits: Vec<char> = hex.chars().filter(|c| !c.is_whitespace()).collect();
@@ -285,6 +286,7 @@ mod tests {
             false => Link::Serial {
                 path: "/dev/ttyUSB0".into(),
                 line: Line { baud: 19200, parity: Parity::Even, stop_bits: 1 },
+                rs485: Rs485::Auto,
             },
         };
         let recording = tape.recording(now, "basement", &link, "a test");

@@ -58,6 +58,8 @@ pub enum End {
     Timeout,
     Checksum,
     WrongFrame,
+    /// What the line returned was not what was sent.
+    Collision,
     /// The link broke.
     Lost,
 }
@@ -71,6 +73,7 @@ impl End {
             Err(RequestError::Timeout) => End::Timeout,
             Err(RequestError::Checksum) => End::Checksum,
             Err(RequestError::WrongFrame) => End::WrongFrame,
+            Err(RequestError::Collision) => End::Collision,
             Err(RequestError::Link(_)) => End::Lost,
             Err(RequestError::Impossible(_)) => return None,
         })
@@ -84,6 +87,7 @@ impl End {
             End::Checksum => [3, 0],
             End::WrongFrame => [4, 0],
             End::Lost => [5, 0],
+            End::Collision => [6, 0],
         }
     }
 
@@ -94,6 +98,7 @@ impl End {
             [2, ..] => End::Timeout,
             [3, ..] => End::Checksum,
             [4, ..] => End::WrongFrame,
+            [6, ..] => End::Collision,
             _ => End::Lost,
         }
     }
@@ -336,6 +341,7 @@ mod tests {
             End::Timeout,
             End::Checksum,
             End::WrongFrame,
+            End::Collision,
             End::Lost,
         ] {
             assert_eq!(End::of_code(&end.code()), end);

@@ -1,0 +1,174 @@
+//! What is wrong on a link that is open: requests that collide, another master, a connection that is mute.
+//!
+//! Modbus RTU has one master. A second one, perhaps a maker's tool that somebody has plugged in, is heard by
+//! the requests that are not ours. The link goes on: what collides with them is asked again.
+
+use std::collections::VecDeque;
+
+use super::{Action, Bus, InFlight, LinkState, Severity};
+use crate::engine::modbus::{Reply, Request, RequestError, RequestsOfOthers};
+use crate::engine::settings::Link;
+use crate::engine::time::{Duration, Time};
+
+/// After so many requests in a row that nobody answers, a TCP connection is made anew.
+const UNANSWERED_UNTIL_RENEWED: u32 = 5;
+/// So often a read that has collided is asked again before it counts as unanswered.
+const REPEATS_MAX: u32 = 3;
+/// The repetition comes at random within this time, or two masters that keep step would collide again.
+const SPREAD: Duration = Duration::from_millis(50);
+/// What was heard this long ago says nothing of now.
+const MEMORY: Duration = Duration::from_secs(60);
+/// Noise that happens to be a request is rare, and does not come twice in a minute.
+const REQUESTS_UNTIL_TOLD: usize = 2;
+/// Requests of others that are remembered.
+const HEARD_MAX: usize = 1000;
+/// Units that are named.
+const UNITS_MAX: usize = 3;
+
+/// What was heard on the line beside the answers.
+#[derive(Debug, Default)]
+pub(super) struct Line {
+    /// The request in flight.
+    asked: Option<(Request, Duration)>,
+    collisions_in_a_row: u32,
+    /// When requests of others were heard, and to which unit.
+    others: VecDeque<(Time, u8)>,
+    /// The log has been told of another master.
+    told: bool,
+}
+
+impl Line {
+    fn hear(&mut self, now: Time, others: RequestsOfOthers) {
+        let count = (others.count as usize).min(HEARD_MAX);
+        self.others.extend(std::iter::repeat_n((now, others.unit), count));
+        let forgotten = self.others.iter().take_while(|(at, _)| now.since(*at) > MEMORY).count();
+        let too_many = self.others.len().saturating_sub(HEARD_MAX);
+        self.others.drain(..forgotten.max(too_many));
+    }
+
+    /// What is wrong with the line, for people.
+    pub(super) fn trouble(&self, now: Time) -> Option<String> {
+        let lately = self.others.iter().filter(|(at, _)| now.since(*at) <= MEMORY);
+        let count = lately.clone().count();
+        if count < REQUESTS_UNTIL_TOLD {
+            return None;
+        }
+        let mut units: Vec<u8> = lately.map(|(_, unit)| *unit).collect();
+        units.sort_unstable();
+        units.dedup();
+        let more = if units.len() > UNITS_MAX { " and others" } else { "" };
+        let named: Vec<String> = units.iter().take(UNITS_MAX).map(u8::to_string).collect();
+        let plural = if units.len() == 1 { "" } else { "s" };
+        let named = named.join(", ");
+        Some(format!(
+            "another master speaks on this line: {count} requests to unit{plural} {named}{more} in the last \
+             minute"
+        ))
+    }
+}
+
+impl Bus {
+    /// Asks the line, and remembers what, in case it collides.
+    pub(super) fn ask(&mut self, request: Request, not_before: Time, timeout: Duration) {
+        self.line.asked = Some((request.clone(), timeout));
+        self.context.actions.push_back(Action::Send { request, not_before, timeout });
+    }
+
+    /// Takes what was heard beside a reply, and says once when another master begins or ends.
+    pub(super) fn look_for_others(&mut self, reply: &Reply) {
+        self.line.hear(self.now, reply.discarded.requests_of_others);
+        let trouble = self.line.trouble(self.now);
+        if trouble.is_some() == self.line.told {
+            return;
+        }
+        self.line.told = trouble.is_some();
+        let (severity, text) = match trouble {
+            Some(trouble) => (Severity::Warning, trouble),
+            None => (Severity::Info, "no other master has spoken for a minute".into()),
+        };
+        self.context.say(severity, format!("bus {}: {text}", self.name));
+    }
+
+    /// Asks a read that has collided again, after whatever may still come for it; returns the request if
+    /// it has ended. A write is never repeated: who is at the other end of the line may have heard it whole,
+    /// and its read-back tells what became of it.
+    pub(super) fn repeat_collided(&mut self, in_flight: InFlight, reply: &Reply) -> Option<InFlight> {
+        let asked = self.line.asked.take();
+        if reply.result != Err(RequestError::Collision) {
+            self.line.collisions_in_a_row = 0;
+            return Some(in_flight);
+        }
+        let repeated = asked.filter(|(request, _)| {
+            !request.call.is_write() && !self.stopping && self.line.collisions_in_a_row < REPEATS_MAX
+        });
+        let Some((request, timeout)) = repeated else {
+            self.line.collisions_in_a_row = 0;
+            return Some(in_flight);
+        };
+        self.line.collisions_in_a_row += 1;
+        let not_before = reply.sent_at + timeout + at_random(self.now);
+        self.in_flight = Some(InFlight { sent_at: not_before, ..in_flight });
+        self.ask(request, not_before, timeout);
+        None
+    }
+
+    /// A serial server may accept a connection and never pass anything on; only a new one helps. A
+    /// serial port has no such state.
+    pub(super) fn renew_silent_connection(&mut self) {
+        let is_connection = !matches!(self.link, Link::Serial { .. });
+        if is_connection && self.unanswered >= UNANSWERED_UNTIL_RENEWED && self.link_state == LinkState::Up {
+            self.unanswered = 0;
+            self.link_state = LinkState::Renewing;
+            self.context.actions.push_back(Action::Reopen { after: Duration::ZERO });
+        }
+    }
+}
+
+/// A part of [`SPREAD`]: the middle of a product with a large odd number is as good as random.
+fn at_random(now: Time) -> Duration {
+    let part = (now.0.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as u32 % 1000;
+    SPREAD * part / 1000
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(seconds: u64) -> Time {
+        Time::from_millis(seconds * 1000)
+    }
+
+    #[test]
+    fn another_master_is_told_by_what_it_asked_in_the_last_minute() {
+        let beginning = "another master speaks on this line: ";
+        for (what, heard, now, expected) in [
+            ("nothing", &[][..], 5, None),
+            ("once may be noise", &[(5, 1, 7)], 6, None),
+            ("one unit", &[(5, 1, 7), (8, 2, 7)], 9, Some("3 requests to unit 7")),
+            ("two units", &[(5, 1, 7), (8, 2, 3)], 9, Some("3 requests to units 3, 7")),
+            (
+                "many units",
+                &[(1, 1, 5), (2, 1, 4), (3, 1, 3), (4, 1, 2)],
+                9,
+                Some("4 requests to units 2, 3, 4 and others"),
+            ),
+            ("some of it long ago", &[(5, 4, 7), (60, 2, 7)], 66, Some("2 requests to unit 7")),
+            ("all of it long ago", &[(5, 4, 7)], 66, None),
+            ("without end", &[(5, 700, 7), (6, 700, 7)], 6, Some("1000 requests to unit 7")),
+        ] {
+            let mut line = Line::default();
+            for (seconds, count, unit) in heard {
+                line.hear(at(*seconds), RequestsOfOthers { count: *count, unit: *unit });
+            }
+            let expected = expected.map(|text| format!("{beginning}{text} in the last minute"));
+            assert_eq!(line.trouble(at(now)), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn repetitions_are_spread() {
+        let spread: Vec<Duration> = (0..20).map(|index| at_random(Time(index * 37_411))).collect();
+        assert!(spread.iter().all(|part| *part < SPREAD));
+        assert!(spread.iter().min() < Some(&(SPREAD / 4)) && spread.iter().max() > Some(&(SPREAD * 3 / 4)));
+    }
+}
