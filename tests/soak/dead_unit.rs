@@ -27,6 +27,22 @@ fn a_unit_that_never_answered_costs_no_more_and_is_back_within_fifteen_seconds()
     check(Duration::ZERO, Duration::from_secs(15));
 }
 
+#[test]
+fn a_unit_that_once_came_late_before_it_died_pays_for_the_silence_that_it_is_given() {
+    let mut world = world(UNITS);
+    world.run_until(world.now + Duration::from_secs(2));
+    // Late by 200 ms, once; long ago when it dies.
+    world.act(DEAD, &Action::Fault("unit=10,slow=700ms".parse().expect("a fault")));
+    world.run_until(world.now + Duration::from_secs(2));
+    world.act(DEAD, &Action::Repair { unit: DEAD });
+    world.run_until(world.now + Duration::from_secs(90));
+    power(&mut world, false);
+    world.run_until(world.now + GROWN);
+    let cost = live_cycle(&mut world) / live_cycle(&mut self::world(UNITS - 1)) - 1.0;
+    // 3 % for what it is known to cost, and as long a quarantine as there is within the longest pause.
+    assert!(cost > 0.01 && cost <= 0.045, "{:.2} %", cost * 100.0);
+}
+
 /// The unit has been alive for so long, and its return is to be noticed within so long.
 #[track_caller]
 fn check(alive: Duration, noticed_within: Duration) {

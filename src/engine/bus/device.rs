@@ -420,6 +420,14 @@ impl DeviceState {
         }
     }
 
+    /// The line was left alone for so long because this device did not answer. While it is away that counts
+    /// in its share of the bus.
+    pub(super) fn charge(&mut self, now: Time, waited: Duration) {
+        if self.patience.is_probing() {
+            self.paused_until = self.paused_until.max(now + Patience::pause_after(waited));
+        }
+    }
+
     pub(super) fn polled(
         &mut self,
         now: Time,

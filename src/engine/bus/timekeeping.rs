@@ -23,6 +23,8 @@ pub(super) struct Timekeeping {
     /// When the last answer's last byte came; `None`: the last request had none, and the line is left
     /// silent for longer than usual.
     quiet_since: Option<Time>,
+    /// The device that left the last request unanswered.
+    to_blame: Option<usize>,
 }
 
 impl Timekeeping {
@@ -37,6 +39,11 @@ impl Timekeeping {
 }
 
 impl Bus {
+    /// Devices have got other numbers.
+    pub(super) fn forget_blame(&mut self) {
+        self.times.to_blame = None;
+    }
+
     /// A request has ended.
     pub(super) fn keep_time(&mut self, asked: &InFlight, reply: &Reply) {
         if matches!(reply.result, Err(RequestError::Link(_) | RequestError::Impossible(_))) {
@@ -69,8 +76,17 @@ impl Bus {
         let answered = matches!(reply.result, Ok(_) | Err(RequestError::Exception(_)));
         self.times.quiet_since = reply.last_byte_at.filter(|_| answered);
 
+        // Who left the line to a quarantine pays for it, and not who had to wait.
+        if let Some(silent) = self.times.to_blame.take() {
+            self.devices[silent].charge(now, waited);
+        }
+        let timed_out = reply.result == Err(RequestError::Timeout);
+        self.times.to_blame = asked.device.filter(|_| timed_out);
         if let Some(device) = asked.device {
             self.devices[device].keep_time(now, waited, turnaround, command_waited);
+            turnaround
+                .into_iter()
+                .for_each(|took| self.devices[device].complain_of_slowness(took, &mut self.context));
         }
     }
 }

@@ -7,6 +7,8 @@
 //! * After a request without an answer the line stays silent for a quarantine, in which a late
 //!   reply is dropped. It ends early when that reply comes. After a probe of a silent device it lasts
 //!   as long as that device's replies have come late before: for most not at all.
+//! * A unit that has been heard to answer late is waited for longer, within bounds: a timeout that is too
+//!   short makes itself known, and does no harm.
 //! * A reply later than the quarantine may meet the next request. If it differs in unit, function
 //!   or count it is told apart. If it does not, a reply to such a request is believed at once only
 //!   behind as many others as there are late ones to come, and at the deadline only if nothing else
@@ -40,6 +42,11 @@ const TURNAROUND: Duration = Duration::from_millis(100);
 const PATIENCE: Duration = Duration::from_secs(1);
 /// A request unanswered for longer gets no answer any more.
 const LATE_MAX: Duration = Duration::from_secs(10);
+/// A unit whose reply came late is given so much of its lateness more, in halves, but never more than as
+/// long again.
+const LATENESS_HALVES: u32 = 3;
+/// After a probe the line is silent for twice as long as that unit has come late, but never longer than this.
+const QUARANTINE_AFTER_PROBE_MAX: Duration = Duration::from_millis(500);
 /// The longest frame (2.5.1.1).
 const FRAME_MAX: u32 = 256;
 /// What is heard beyond this without a frame in it is noise.
@@ -73,7 +80,7 @@ pub struct Guard {
     busy_until: Option<Time>,
     quarantine_until: Option<Time>,
     unanswered: Vec<Unanswered>,
-    /// How late each unit's latest reply came, behind its timeout.
+    /// How late each unit's latest reply came, behind the timeout that was asked for.
     lateness: BTreeMap<u8, Duration>,
     discarded: Discarded,
 }
@@ -184,7 +191,8 @@ impl Guard {
         self.quarantine_until = None;
         let transmitted_at = now + self.delay_before_send + self.line.characters(self.frame.len() as u32);
         self.busy_until = Some(transmitted_at);
-        let wait = if request.unit == 0 { TURNAROUND } else { timeout };
+        let wait =
+            if request.unit == 0 { TURNAROUND } else { timeout + self.more_time(request.unit, timeout) };
         let deadline = transmitted_at + wait;
         self.state = State::Waiting(Waiting {
             request,
@@ -407,8 +415,13 @@ impl Guard {
     /// The deadline has passed.
     fn unanswered(&mut self, now: Time, waiting: Waiting) -> Reply {
         let reply = self.failed(waiting.clone(), false);
+        let unit = waiting.request.unit;
+        let lateness = self.lateness.get(&unit).copied().unwrap_or_default();
         let quarantine = match waiting.request.is_probe {
-            true => self.lateness.get(&waiting.request.unit).copied().unwrap_or_default() * 2,
+            true => {
+                let late = (lateness * 2).saturating_sub(self.more_time(unit, waiting.timeout));
+                late.min(QUARANTINE_AFTER_PROBE_MAX)
+            }
             false => self.quarantine.unwrap_or(waiting.timeout),
         };
         self.quarantine_until = Some(now + quarantine);
@@ -416,8 +429,15 @@ impl Guard {
         reply
     }
 
+    /// How much longer than its timeout a unit is waited for.
+    fn more_time(&self, unit: u8, timeout: Duration) -> Duration {
+        let lateness = self.lateness.get(&unit).copied().unwrap_or_default();
+        (lateness * LATENESS_HALVES / 2).min(timeout)
+    }
+
     fn remember(&mut self, waiting: &Waiting, at: Time) {
-        self.unanswered.push(Unanswered { request: waiting.request.clone(), at });
+        let due = waiting.transmitted_at + waiting.timeout;
+        self.unanswered.push(Unanswered { request: waiting.request.clone(), due, at });
     }
 
     /// Ends a request without an answer, with the error that what was heard amounts to.
@@ -519,7 +539,7 @@ impl Guard {
                 let late = &self.unanswered[index];
                 if let Some(heard_at) = self.heard_at.get(at + length - 1) {
                     let lateness = self.lateness.entry(late.request.unit).or_default();
-                    *lateness = (*lateness).max(heard_at.since(late.at));
+                    *lateness = (*lateness).max(heard_at.since(late.due));
                 }
                 // The quarantine waits for the last one.
                 if index + 1 == self.unanswered.len() {

@@ -17,10 +17,13 @@ pub fn frame(unit: u8, pdu: &[u8]) -> Vec<u8> {
     frame
 }
 
-/// A request that nobody answered yet, and when it was given up.
+/// A request that nobody answered yet.
 #[derive(Clone, Debug)]
 pub struct Unanswered {
     pub request: Request,
+    /// When its answer should have come.
+    pub due: Time,
+    /// When it was given up.
     pub at: Time,
 }
 

@@ -629,12 +629,36 @@ fn after_a_probe_the_line_waits_only_as_long_as_that_unit_has_come_late_before()
     // One that is heard between two requests says how late that unit is.
     scene.ask(&probe());
     scene.expect("no answer", Err(RequestError::Timeout));
-    let given_up_at = scene.now;
     scene.wait(30).hears(framed("01 04 04 00 63 00 63"));
     scene.ask(&probe());
+    let due = scene.now + LINE.characters(8) + TIMEOUT;
     scene.expect("no answer again", Err(RequestError::Timeout));
-    let next_given_up_at = scene.now;
     assert_eq!(scene.guard.begin(scene.now, &other, TIMEOUT), None);
-    assert_eq!(scene.guard.earliest_send(scene.now), next_given_up_at + Duration::from_millis(60));
-    assert!(next_given_up_at > given_up_at);
+    assert_eq!(scene.guard.earliest_send(scene.now), due + Duration::from_millis(60));
+}
+
+#[test]
+fn a_unit_that_has_answered_late_is_waited_for_longer() {
+    // By how much it is late, and how long it is waited for then.
+    for (late, expected) in [(40, 260), (120, 380), (190, 400)] {
+        let mut scene = Scene::without_echo();
+        scene.ask(&two_inputs());
+        scene.expect("no answer", Err(RequestError::Timeout));
+        scene.wait(late).hears(framed("01 04 04 00 63 00 63"));
+        // Another unit is not.
+        for (request, wait) in [(two_inputs(), expected), (read(2, Table::Input, 0, 2), 200)] {
+            scene.ask(&request);
+            let sent_at = scene.now + LINE.characters(8);
+            scene.expect("no answer", Err(RequestError::Timeout));
+            assert_eq!(
+                scene.now - sent_at,
+                Duration::from_millis(wait),
+                "{late} ms late, unit {}",
+                request.unit
+            );
+            scene.wait(1000);
+        }
+        scene.ask(&two_inputs()).wait(150 + late).hears(framed("01 04 04 00 01 00 02"));
+        scene.expect("in time, since it is known", words(&[1, 2]));
+    }
 }

@@ -91,6 +91,11 @@ impl Patience {
         short.max(demanded.unwrap_or_default()).min(full)
     }
 
+    /// The pause after which what took so much of the bus is within a silent device's share.
+    pub(super) fn pause_after(taken: Duration) -> Duration {
+        (taken * SHARE).min(PAUSE_LONGEST)
+    }
+
     /// How long to leave the device alone after a request in vain: 0.25 s, 0.5 s, 1 s, and so on up to
     /// what keeps it within its share of the bus. A probe that waited longer than most is followed by no
     /// longer pause, or the device's return would be noticed late just then. `unit` makes the pauses of
@@ -99,7 +104,7 @@ impl Patience {
         let short = self.short_probe(full, demanded);
         let usual = if self.slowest_answer.is_some() { short } else { (short + full) / 2 };
         let backoff = Duration::from_millis(125 << self.failures.min(8));
-        let longest = ((usual + FRAME) * SHARE).min(PAUSE_LONGEST);
+        let longest = Patience::pause_after(usual + FRAME);
         let jitter = (self.failures.wrapping_mul(7) + u32::from(unit) * 5) % (JITTER_PERCENT + 1);
         backoff.min(longest) * (100 - jitter) / 100
     }

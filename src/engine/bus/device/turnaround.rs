@@ -24,12 +24,20 @@ pub(super) struct Turnaround {
     typical: Duration,
     /// Answers since the plan was thought over.
     answers: u32,
+    /// The log has been told that it is slower than it may be.
+    told_slow: bool,
 }
 
 impl Default for Turnaround {
     fn default() -> Turnaround {
         let planned_with = plan::USUAL_TURNAROUND;
-        Turnaround { timing: Timing::default(), planned_with, typical: planned_with, answers: 0 }
+        Turnaround {
+            timing: Timing::default(),
+            planned_with,
+            typical: planned_with,
+            answers: 0,
+            told_slow: false,
+        }
     }
 }
 
@@ -64,6 +72,21 @@ impl Turnaround {
 }
 
 impl DeviceState {
+    /// Says once that an answer came only because the device is waited for longer than it should need.
+    pub(in crate::engine::bus) fn complain_of_slowness(&mut self, took: Duration, context: &mut Context) {
+        let limit = self.full_timeout;
+        // Nobody is waited for twice as long.
+        if took <= limit || took >= limit * 2 || std::mem::replace(&mut self.turnaround.told_slow, true) {
+            return;
+        }
+        let (name, took, limit) = (&self.settings.name, took.as_millis(), limit.as_millis());
+        let text = format!(
+            "device {name} answers after {took} ms, later than the response timeout of {limit} ms; it is waited \
+             for, but a longer `response_timeout` of its bus or profile would spare the others"
+        );
+        context.say(Severity::Warning, text);
+    }
+
     /// A request to it has ended.
     pub(in crate::engine::bus) fn keep_time(
         &mut self,
