@@ -130,7 +130,11 @@ mod tests {
         let made = (0..600).filter(|at| watch.ask(minute(*at)).is_ok());
         let expected = (0..10).flat_map(|hour| (0..10).map(move |at| hour * 60 + at));
         assert_eq!(made.collect::<Vec<u64>>(), expected.collect::<Vec<u64>>());
-        assert_eq!(watch.ask(minute(599)), Err(Duration::from_secs(60)), "the first of the last hour was at 540");
+        assert_eq!(
+            watch.ask(minute(599)),
+            Err(Duration::from_secs(60)),
+            "the first of the last hour was at 540"
+        );
     }
 
     #[test]
