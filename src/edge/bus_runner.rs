@@ -223,7 +223,7 @@ impl BusRunner {
     }
 
     fn read_letters(&mut self) {
-        // At most as many as can wait, so that a flood does not keep the line waiting.
+        // At most as many as strangers can send, so that a flood does not keep the line waiting.
         for _ in 0..Inbox::LIMIT {
             let event = lock(&self.inbox).take();
             let Some(event) = event else { break };
@@ -298,6 +298,7 @@ impl BusRunner {
         self.saving.retain(|saving| !saving.is_finished());
         let (inbox, bell, clock) = (self.inbox.clone(), self.bell.clone(), self.clock);
         let (folder, keep) = (self.state.recordings().map(Path::to_path_buf), self.settings.recorder.keep);
+        let asked = request.clone();
         let saving = std::thread::Builder::new().name("recording".into()).spawn(move || {
             let result = match folder {
                 Some(folder) => recordings::save(&folder, &recording, clock, keep),
@@ -309,7 +310,9 @@ impl BusRunner {
         });
         match saving {
             Ok(saving) => self.saving.push(saving),
-            Err(error) => tracing::error!("no thread can be started: {error}"),
+            Err(error) => {
+                self.handle(Event::Recorded(asked, Err(format!("no thread can be started: {error}"))));
+            }
         }
     }
 

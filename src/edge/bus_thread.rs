@@ -1,4 +1,5 @@
-//! The threads that run buses. A serial line has one of its own, TCP connections share one.
+//! The threads that run buses. A line has one of its own, also behind a serial server; Modbus TCP connections
+//! share one.
 //!
 //! Threads and not tasks: the silence between two frames is 2 ms, and a timer that is a millisecond late
 //! costs a tenth of a fast line. A connection has no such silence; there it is a thread's waking up that

@@ -134,9 +134,11 @@ fn what_does_not_fit_into_the_inbox_is_refused_and_not_waited_for() {
     let bus = Threads::default()
         .start(settings("/dev/no-such", "1s"), 0, Clock::start(), nowhere(), Box::new(publish))
         .expect("a thread");
-    let taken = (0..=Inbox::LIMIT).filter(|_| bus.send(Event::BrokerUp).is_ok()).count();
+    let get = || Event::Get { device: "thermometer".into(), point: "temperature".into() };
+    let taken = (0..=Inbox::LIMIT).filter(|_| bus.send(get()).is_ok()).count();
     assert_eq!(taken, Inbox::LIMIT);
-    assert_eq!(bus.send(Event::BrokerUp), Err(Full));
+    assert_eq!(bus.send(get()), Err(Full));
+    assert_eq!(bus.send(Event::BrokerDown), Ok(None), "news of the gateway itself have room all the same");
     let looks: Vec<_> = (0..LOOKS_MAX).map(|_| bus.inspect(|_, _| ())).collect();
     assert!(bus.inspect(|_, _| ()).blocking_recv().is_err(), "a question is refused as well");
     drop(looks);

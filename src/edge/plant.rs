@@ -174,7 +174,7 @@ impl Parts {
 
     fn tell_all(&self, event: &Event) {
         for bus in &self.buses {
-            // A bus with a full inbox is stuck, and is reported as that.
+            // A bus that has no room for this is stuck, and is reported as that: no flood fills it so far.
             if bus.send(event.clone()).is_err() {
                 tracing::warn!("a bus does not take news of the broker");
             }

@@ -4,6 +4,7 @@ use std::fs::{self, DirEntry, File, OpenOptions};
 use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
 use crate::edge::clock::Clock;
 use crate::engine::bus::Saved;
@@ -13,15 +14,19 @@ use crate::engine::recorder::files::{self, Kept};
 /// Who runs the gateway may read and write it, and its group read it.
 const MODE: u32 = 0o640;
 
+/// One at a time: a name is chosen by the names that are there, and all are written under the same one first.
+static SAVING: Mutex<()> = Mutex::new(());
+
 /// Makes a file of the recording in `folder`. The bus keeps not more than `keep` of them.
 pub fn save(folder: &Path, recording: &Recording, clock: Clock, keep: usize) -> Result<Saved, String> {
     let cannot = |error: io::Error| format!("`{}` cannot be written: {error}", folder.display());
+    let _alone = SAVING.lock().unwrap_or_else(PoisonError::into_inner);
     fs::create_dir_all(folder).map_err(cannot)?;
     let (bytes, frames) = recording.to_pcapng(clock.since_1970_at(recording.made_at));
     let others = kept(folder).map_err(cannot)?;
     for name in files::superfluous(&recording.bus, bytes.len() as u64, &others, keep) {
         match fs::remove_file(folder.join(name)) {
-            // Another bus was faster.
+            // Somebody else has tidied up.
             Err(error) if error.kind() == ErrorKind::NotFound => {}
             result => result.map_err(cannot)?,
         }
@@ -43,7 +48,8 @@ fn kept(folder: &Path) -> io::Result<Vec<Kept>> {
 
 /// Whoever looks finds it whole or not at all.
 fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let temporary = path.with_extension("new");
+    // Always the same name: what a loss of power leaves half written is replaced by the next.
+    let temporary = path.with_file_name("unfinished");
     let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(MODE).open(&temporary)?;
     let written =
         file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| fs::rename(&temporary, path));
@@ -89,6 +95,23 @@ mod tests {
         };
         assert_eq!((count("plant-"), count("attic-")), (3, 1));
         assert_eq!(kept(&folder).expect("the folder is there").len(), 4, "and nothing else is left behind");
+    }
+
+    #[test]
+    fn several_in_the_same_moment_are_several_whole_files() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (folder, clock) = (folder.path(), Clock::start());
+        let mut paths: Vec<String> = std::thread::scope(|scope| {
+            let save = || save(folder, &recording("plant"), clock, 100).expect("there is room").path;
+            let threads: Vec<_> = (0..8).map(|_| scope.spawn(save)).collect();
+            threads.into_iter().map(|thread| thread.join().expect("it does not panic")).collect()
+        });
+        paths.sort();
+        paths.dedup();
+        assert_eq!(paths.len(), 8, "{paths:?}");
+        let length = |path: &String| fs::metadata(path).expect("the file is there").len();
+        assert!(paths.iter().all(|path| length(path) == length(&paths[0])));
+        assert_eq!(kept(folder).expect("the folder is there").len(), 8, "nothing else is left behind");
     }
 
     #[test]

@@ -9,16 +9,14 @@ mod replies;
 mod stage;
 #[path = "../support/mod.rs"]
 mod support;
+#[path = "../support/table.rs"]
+mod table;
 mod values;
 
-use std::fs;
-use std::path::Path;
 use std::sync::Mutex;
 use std::thread;
 
 const DOCUMENT: &str = "docs/field-problems.md";
-const TABLE_BEGINS: &str = "<!-- table: written by `make goldens` -->\n";
-const TABLE_ENDS: &str = "<!-- end of table -->";
 
 /// Rows that run at the same time; most of each is waiting.
 const AT_ONCE: usize = 6;
@@ -74,20 +72,5 @@ fn whatever_happens_on_the_wire_nothing_false_is_published_and_nothing_is_lost()
     for row in &rows {
         table += &format!("| {} | {} | {} | {} |\n", row.number, row.fault, row.done, row.seen);
     }
-    check_document(&table);
-}
-
-/// Compares the table with the document's, or writes it there.
-#[track_caller]
-fn check_document(table: &str) {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(DOCUMENT);
-    let text = fs::read_to_string(&path).expect("the document is readable");
-    let (before, rest) = text.split_once(TABLE_BEGINS).expect("the table's beginning is marked");
-    let (found, after) = rest.split_once(TABLE_ENDS).expect("the table's end is marked");
-    if std::env::var_os("BLESS").is_some() {
-        let text = format!("{before}{TABLE_BEGINS}{table}{TABLE_ENDS}{after}");
-        fs::write(&path, text).expect("the document is written");
-    } else {
-        assert_eq!(found, table, "{DOCUMENT} is out of date; run `make goldens`");
-    }
+    table::check_document(DOCUMENT, &table);
 }

@@ -2,8 +2,6 @@
 //! `docs/reliability.md` is made from these rows.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::path::Path;
 use std::sync::Mutex;
 use std::thread;
 
@@ -12,11 +10,9 @@ use busker::simulator::{Simulation, TcpPort};
 
 use super::proxy::Proxy;
 use super::rig::{self, Broker, Gateway, Watcher};
-use super::{configuration, json, over_tcp, relay, remembered, simulation};
+use super::{configuration, json, over_tcp, relay, remembered, simulation, table};
 
 const DOCUMENT: &str = "docs/reliability.md";
-const TABLE_BEGINS: &str = "<!-- table: written by `make goldens` -->\n";
-const TABLE_ENDS: &str = "<!-- end of table -->";
 
 /// Rows that run at the same time; most of each is waiting.
 const AT_ONCE: usize = 6;
@@ -327,22 +323,7 @@ fn whatever_happens_to_the_broker_nothing_is_lost_and_no_stale_command_is_obeyed
         table += &format!("| {} | {} | {lost} |\n", row.fault, row.command.told());
     }
     assert!(results.iter().all(Vec::is_empty), "something is lost:\n{table}");
-    check_document(&table);
-}
-
-/// Compares the table with the document's, or writes it there.
-#[track_caller]
-fn check_document(table: &str) {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(DOCUMENT);
-    let text = fs::read_to_string(&path).expect("the document is readable");
-    let (before, rest) = text.split_once(TABLE_BEGINS).expect("the table's beginning is marked");
-    let (found, after) = rest.split_once(TABLE_ENDS).expect("the table's end is marked");
-    if std::env::var_os("BLESS").is_some() {
-        let text = format!("{before}{TABLE_BEGINS}{table}{TABLE_ENDS}{after}");
-        fs::write(&path, text).expect("the document is written");
-    } else {
-        assert_eq!(found, table, "{DOCUMENT} is out of date; run `make goldens`");
-    }
+    table::check_document(DOCUMENT, &table);
 }
 
 impl Row {

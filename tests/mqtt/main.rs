@@ -10,6 +10,8 @@ mod reload;
 mod requests;
 mod rig;
 mod secure;
+#[path = "../support/table.rs"]
+mod table;
 mod watching;
 
 use std::collections::BTreeSet;

@@ -161,7 +161,7 @@ def main(stack):
 
     # Devices that answer, with values; one that does not, with why; a bus that is down, with why.
     page.wait(row("relays", "Relay 1") + " === 'fresh: OFF'", "a relay")
-    page.wait(row("meter", "Voltage 1") + "?.startsWith('fresh: 230')", "a voltage")
+    page.wait(row("meter", "Voltage of phase 1") + "?.startsWith('fresh: 230')", "a voltage")
     page.wait("document.querySelector('#device-meter .about').innerText.includes('METZ CONNECT GmbH MR-SM3')", "identity")
     offline = page.wait(
         "(() => { const why = document.querySelector('#device-missing .why');"
@@ -215,6 +215,10 @@ def main(stack):
         time.sleep(0.05)
     begin = files[0].read_bytes()[:12]
     assert begin[:4] == b"\n\r\r\n" and begin[8:] == b"M<+\x1a", begin
+
+    # How a device does on its wire, for who looks.
+    page.evaluate("[...document.querySelectorAll('#device-relays details')].pop().open = true")
+    page.wait("/[0-9.]+ m?s turnaround \\(95 % within\\)/.test(document.querySelector('#device-relays').innerText)", "the turnaround")
 
     # Without a mouse: Tab comes to what can be opened, Enter opens it.
     page.evaluate("document.querySelector('#device-relays details.setting summary').focus()")

@@ -73,9 +73,15 @@ impl Link {
     }
 
     fn wait_for_room(&self) -> Result<(), Lost> {
+        let full = Lost("nothing can be written to it".into());
+        // A frame is so small that only a connection that takes nothing any more has no room for it. Its
+        // thread may serve others, and does not wait.
+        if matches!(self, Link::Tcp(_)) {
+            return Err(full);
+        }
         let mut descriptors = [PollFd::new(self, PollFlags::OUT)];
         match poll(&mut descriptors, Some(&timespec(WRITE_TIMEOUT))) {
-            Ok(0) => Err(Lost("nothing can be written to it".into())),
+            Ok(0) => Err(full),
             Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
             Err(error) => Err(self.failed(error.into())),
         }

@@ -24,3 +24,29 @@ pub fn connect(host: &str, port: u16) -> Result<TcpStream, Lost> {
     }
     Err(failure)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+
+    use super::*;
+    use crate::edge::clock::Clock;
+    use crate::edge::link::Link;
+
+    #[test]
+    fn a_server_that_takes_nothing_keeps_no_thread_waiting() {
+        let server = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let port = server.local_addr().expect("a port").port();
+        let link = Link::Tcp(connect("127.0.0.1", port).expect("it listens"));
+        let clock = Clock::start();
+        // Some megabytes fit into what the kernel keeps.
+        let lost = loop {
+            let began = clock.now();
+            if let Err(lost) = link.write(&[0; 4096]) {
+                break (lost, clock.now() - began);
+            }
+        };
+        assert_eq!(lost.0, Lost("nothing can be written to it".into()));
+        assert!(lost.1 < Duration::from_secs(1), "{:?}", lost.1);
+    }
+}

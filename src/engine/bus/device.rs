@@ -451,8 +451,9 @@ impl DeviceState {
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
                 self.failed(now, &error, context);
-                match self.presence {
-                    Presence::Present => self.polls.try_again(index, now),
+                match (&self.presence, error) {
+                    (Presence::Present, RequestError::Timeout) => self.polls.try_again(index, now),
+                    // It is there, and only its answer was spoilt.
                     _ => self.polls.want_again(index),
                 }
             }

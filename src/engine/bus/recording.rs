@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use crate::engine::modbus::{Reply, RequestError};
-use crate::engine::recorder::watch::Watch;
+use crate::engine::recorder::watch::{ASKED_MAX, Watch};
 use crate::engine::recorder::{End, Recording, Tape};
 use crate::engine::request::{Request, Status};
 use crate::engine::settings;
@@ -98,6 +98,14 @@ impl Bus {
                 &request,
                 "nothing is recorded; the configuration says `kilobytes: 0` under `recorder`",
             );
+        }
+        if let Err(wait) = self.recorder.watch.ask(self.now) {
+            let reason = format!(
+                "{ASKED_MAX} files were made on request within an hour, and more would wear out a memory card; ask \
+                 again in {} min, or load the frames from the status page, which makes no file here",
+                wait.as_secs().div_ceil(60)
+            );
+            return self.refuse(&request, &reason);
         }
         self.save("on request", Some(request));
     }

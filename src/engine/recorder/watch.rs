@@ -1,5 +1,7 @@
-//! When a recording is worth a file: some time after something went wrong on the bus, and not too
-//! often, for the file lands on a memory card.
+//! When a recording is worth a file: some time after something went wrong on the bus, or when somebody
+//! asks; and not too often, for the file lands on a memory card.
+
+use std::collections::VecDeque;
 
 use crate::engine::time::{Duration, Time};
 
@@ -9,6 +11,9 @@ const TIME_AFTER: Duration = Duration::from_secs(5);
 /// While something goes wrong again and again, the pause between two files doubles until it is so many
 /// times the shortest.
 const PAUSE_GROWS_TO: u32 = 16;
+/// So many files are made on request in so long: whoever may speak to the broker could ask without end.
+pub const ASKED_MAX: usize = 10;
+const ASKED_WITHIN: Duration = Duration::from_secs(3600);
 
 /// Waits for trouble.
 #[derive(Clone, Debug)]
@@ -19,6 +24,8 @@ pub struct Watch {
     trouble: Option<Trouble>,
     pause: Duration,
     saved_at: Option<Time>,
+    /// When files were made on request, the last hour's.
+    asked: VecDeque<Time>,
 }
 
 /// Something went wrong, and what follows is waited for.
@@ -34,7 +41,7 @@ impl Watch {
     pub fn new(interval: Option<Duration>) -> Watch {
         let is_on = interval.is_some();
         let interval = interval.unwrap_or_default();
-        Watch { is_on, interval, trouble: None, pause: interval, saved_at: None }
+        Watch { is_on, interval, trouble: None, pause: interval, saved_at: None, asked: VecDeque::new() }
     }
 
     /// Something went wrong. `why` is asked for only where it will be told.
@@ -70,6 +77,19 @@ impl Watch {
         self.saved_at = Some(now);
         self.trouble.take().map(|trouble| trouble.why)
     }
+
+    /// Somebody asks for a file. An error: too many have been made, and how long it takes until one may be
+    /// made again.
+    pub fn ask(&mut self, now: Time) -> Result<(), Duration> {
+        self.asked.retain(|at| now < *at + ASKED_WITHIN);
+        match self.asked.front() {
+            Some(first) if self.asked.len() >= ASKED_MAX => Err(*first + ASKED_WITHIN - now),
+            _ => {
+                self.asked.push_back(now);
+                Ok(())
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -101,6 +121,20 @@ mod tests {
         // A whole year of nothing but trouble, with the shortest interval.
         let year = files(1, 0..365 * 1440).len();
         assert!(year < 366 * 90, "{year}");
+    }
+
+    #[test]
+    fn who_asks_without_end_gets_some_files_an_hour() {
+        let mut watch = Watch::new(None);
+        let minute = |minute: u64| Time(minute * MINUTE);
+        let made = (0..600).filter(|at| watch.ask(minute(*at)).is_ok());
+        let expected = (0..10).flat_map(|hour| (0..10).map(move |at| hour * 60 + at));
+        assert_eq!(made.collect::<Vec<u64>>(), expected.collect::<Vec<u64>>());
+        assert_eq!(
+            watch.ask(minute(599)),
+            Err(Duration::from_secs(60)),
+            "the first of the last hour was at 540"
+        );
     }
 
     #[test]
