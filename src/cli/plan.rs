@@ -9,9 +9,11 @@ use super::output::{print, print_json};
 use super::profiles::load_file;
 use super::{Failure, configuration};
 use crate::engine::device::Device;
-use crate::engine::plan::{self, Cost, Read, Tariff, USUAL_TURNAROUND};
+use crate::engine::plan::{self, Read, Tariff};
 use crate::engine::profile::Library;
 use crate::engine::settings::{Line, Link, Parity, Rs485};
+use crate::engine::time::Duration;
+use crate::engine::yaml::Scalar;
 
 /// Show the reads that each device will be asked with
 ///
@@ -28,6 +30,9 @@ pub struct Args {
     /// The plan of a profile, or of a profile's file, on a line of 19200 8E1, without a configuration
     #[arg(long, value_name = "ID|FILE", conflicts_with_all = ["config", "device"])]
     profile: Option<String>,
+    /// What devices need to begin their answer; see `turnaround` on the status page or in the metrics
+    #[arg(long, value_name = "TIME", default_value = "5ms", value_parser = <Duration as Scalar>::parse)]
+    turnaround: Duration,
     /// Tell it as JSON
     #[arg(long)]
     json: bool,
@@ -57,7 +62,7 @@ struct ReadRow {
 
 pub fn run(args: Args) -> Result<(), Failure> {
     let plans = match &args.profile {
-        Some(id) => vec![of_profile(id)?],
+        Some(id) => vec![of_profile(id, args.turnaround)?],
         None => of_configuration(&args)?,
     };
     if args.json {
@@ -74,12 +79,12 @@ pub fn run(args: Args) -> Result<(), Failure> {
     print(&format!("{}\n", text.trim_end_matches('\n')))
 }
 
-fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
+fn of_profile(id: &str, turnaround: Duration) -> Result<DevicePlan, Failure> {
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
     let link = Link::Serial { path: String::new(), line, rs485: Rs485::Auto };
-    let cost = Tariff::of(&link, None).cost(USUAL_TURNAROUND);
+    let tariff = Tariff::of(&link, None);
     if id.ends_with(".yaml") {
-        return Ok(plan_of(id, &load_file(Path::new(id))?, cost));
+        return Ok(plan_of(id, &load_file(Path::new(id))?, tariff, turnaround));
     }
     let library = Library::shipped();
     if !library.contains(id) {
@@ -89,7 +94,7 @@ fn of_profile(id: &str) -> Result<DevicePlan, Failure> {
         )));
     }
     let device = library.load(id).map_err(configuration::faults)?;
-    Ok(plan_of(id, &device, cost))
+    Ok(plan_of(id, &device, tariff, turnaround))
 }
 
 fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
@@ -108,14 +113,14 @@ fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
         .into_iter()
         .map(|device| {
             let bus = &settings.buses[device.bus];
-            let cost = Tariff::of(&bus.link, bus.gap).cost(USUAL_TURNAROUND);
-            plan_of(&device.name, &device.device, cost)
+            plan_of(&device.name, &device.device, Tariff::of(&bus.link, bus.gap), args.turnaround)
         })
         .collect())
 }
 
-fn plan_of(name: &str, device: &Device, cost: Cost) -> DevicePlan {
-    let reads = plan::plan(device, cost, &[]);
+fn plan_of(name: &str, device: &Device, tariff: Tariff, turnaround: Duration) -> DevicePlan {
+    let reads = plan::plan(device, tariff.cost(plan::planned_with(turnaround)), &[]);
+    let cost = tariff.cost(turnaround);
     let row = |read: &Read| ReadRow {
         poll: read.poll.name(),
         table: read.span.table().name(),

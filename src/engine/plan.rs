@@ -134,6 +134,11 @@ pub fn is_far(turnaround: Duration, planned_with: Duration) -> bool {
     turnaround > planned_with * FAR || turnaround * FAR < planned_with
 }
 
+/// The turnaround for which the reads of a device that needs `turnaround` are planned, once it is known.
+pub fn planned_with(turnaround: Duration) -> Duration {
+    if is_far(turnaround, USUAL_TURNAROUND) { turnaround } else { USUAL_TURNAROUND }
+}
+
 /// The bytes of data in the answer to a read of `span`.
 pub fn data_bytes(span: Span) -> u32 {
     if span.table().is_bits() { span.count().div_ceil(8) } else { span.count() * 2 }

@@ -1,6 +1,7 @@
 //! What a bus does with its wire, on simulated time: as `busker check` forecasts it, and with plans that
 //! follow the devices.
 
+mod feeding;
 mod forecast;
 mod plans;
 mod wire;

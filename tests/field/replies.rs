@@ -31,7 +31,7 @@ pub const ROWS: &[Row] = &[
         number: 5,
         fault: "A USB adapter hands bytes over only every 16 ms",
         done: "Each reply is held back for 16 ms, in two portions where it is longer than an adapter's buffer",
-        seen: "Reads on, only slower. (That the program sets the driver's latency timer was not tried here: a pseudo-terminal has none)",
+        seen: "Reads on, only slower. The driver is asked for low latency when the port is opened, which makes 1 ms of the 16. (That it grants it was not tried here: a pseudo-terminal has no such timer)",
         run: held_back,
     },
     Row {

@@ -35,10 +35,15 @@ fn slower(devices: &[&DeviceSettings], budget: &Budget) -> String {
     }
     let heaviest = groups.iter().max_by(|one, other| one.1.total_cmp(other.1));
     let Some((&(class, period), &load)) = heaviest else { return String::new() };
-    let left = COMFORTABLE - (budget.load() - load);
+    // What is fed is asked the more beside its polls the less it is polled.
+    let for_polls = COMFORTABLE - budget.load_of_feeding();
+    let left = for_polls - (budget.load_of_polls() - load);
     let period = Duration::from_micros(period);
+    if for_polls <= 0.0 {
+        return "allow watchdogs and heartbeats more time: they take the whole wire".into();
+    }
     if left <= 0.0 {
-        let factor = budget.load() / COMFORTABLE;
+        let factor = budget.load_of_polls() / for_polls;
         return format!("poll everything {:.1} times less often", (factor * 10.0).ceil() / 10.0);
     }
     let others = groups.keys().filter(|(other, _)| *other == class).count() > 1;

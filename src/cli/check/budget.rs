@@ -1,5 +1,8 @@
-//! What the polls of a bus ask of its wire: arithmetic, from the plan and the wire's own charges.
+//! What the polls of a bus ask of its wire, and what watchdogs and heartbeats want besides: arithmetic,
+//! from the plan and the wire's own charges.
 
+use super::feeding::Wants;
+use super::round;
 use crate::engine::device::Poll;
 use crate::engine::plan::{self, Tariff, plan};
 use crate::engine::settings::{Bus, DeviceSettings, Link};
@@ -12,6 +15,8 @@ pub struct Planned {
     pub poll: Poll,
     /// How often it is wanted; `None`: once.
     pub period: Option<f64>,
+    /// Reading it changes the device: a watchdog is fed by another one, if there is any.
+    pub alone: bool,
     /// The silence before it, both frames, the device's turnaround.
     pub time: f64,
 }
@@ -19,6 +24,8 @@ pub struct Planned {
 /// All reads of one bus.
 pub struct Budget {
     pub reads: Vec<Planned>,
+    /// What each device wants besides, by its number on this bus.
+    pub wants: Vec<Wants>,
     /// How long a request to a device that is silent keeps the bus: the wait for its answer, and on a
     /// serial line as long again for a late one.
     pub one_silent: f64,
@@ -28,15 +35,13 @@ impl Budget {
     pub fn of(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> Budget {
         let tariff = Tariff::of(&bus.link, bus.gap);
         // As the running program plans them once it knows the device.
-        let planned_with = match plan::is_far(turnaround, plan::USUAL_TURNAROUND) {
-            true => turnaround,
-            false => plan::USUAL_TURNAROUND,
-        };
-        let mut reads = Vec::new();
+        let planned_with = plan::planned_with(turnaround);
+        let (mut reads, mut wants) = (Vec::new(), Vec::new());
         let mut longest_timeout = bus.response_timeout;
         for (device, settings) in devices.iter().enumerate() {
             let wire = &settings.device.wire;
             longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
+            wants.push(Wants::of(settings, tariff.cost(turnaround)));
             for read in plan(&settings.device, tariff.cost(planned_with), &[]) {
                 let time = tariff.cost(turnaround).time_of(read.span) + wire.limits.delay;
                 let period = match read.poll {
@@ -44,7 +49,8 @@ impl Budget {
                     Poll::Slow => Some(wire.intervals.slow.as_secs_f64()),
                     Poll::Once | Poll::Never => None,
                 };
-                reads.push(Planned { device, poll: read.poll, period, time: time.as_secs_f64() });
+                let (poll, alone, time) = (read.poll, read.alone, time.as_secs_f64());
+                reads.push(Planned { device, poll, period, alone, time });
             }
         }
         let one_silent = match &bus.link {
@@ -53,12 +59,52 @@ impl Budget {
                 line.characters(8) + longest_timeout * 2 + bus.gap.unwrap_or_else(|| line.frame_gap())
             }
         };
-        Budget { reads, one_silent: one_silent.as_secs_f64() }
+        Budget { reads, wants, one_silent: one_silent.as_secs_f64() }
     }
 
     /// Seconds of wire that are wanted in a second; above 1 every period is longer by as much.
     pub fn load(&self) -> f64 {
+        let load = self.load_at(1.0);
+        // Where feeding alone is too much, no stretch of the polls makes room for it.
+        if load <= 1.0 || self.load_of_feeding() >= 1.0 { load } else { self.stretch() }
+    }
+
+    /// The same of the polls alone.
+    pub fn load_of_polls(&self) -> f64 {
         self.reads.iter().filter_map(Planned::load).sum()
+    }
+
+    /// The most that watchdogs and heartbeats want of it, however seldom their devices are polled.
+    pub fn load_of_feeding(&self) -> f64 {
+        let of_device = |(device, wants): (usize, &Wants)| {
+            let reads = self.reads.iter().filter(|read| read.device == device);
+            let longest = reads.map(|read| read.time).fold(0.0, f64::max);
+            wants.fed_every.map_or(0.0, |every| longest / every) + wants.load_of_beats()
+        };
+        self.wants.iter().enumerate().map(of_device).sum()
+    }
+
+    /// What is wanted of the wire while every period is so many times as long: watchdogs and heartbeats do
+    /// not wait longer for that.
+    fn load_at(&self, stretch: f64) -> f64 {
+        let of_device = |(device, wants): (usize, &Wants)| {
+            let reads = self.reads.iter().filter(|read| read.device == device);
+            match wants.fed_every {
+                None => reads.filter_map(Planned::load).sum::<f64>() / stretch + wants.load_of_beats(),
+                Some(every) => round::load(&reads.collect::<Vec<_>>(), &wants.beats, every, stretch),
+            }
+        };
+        self.wants.iter().enumerate().map(of_device).sum()
+    }
+
+    /// How many times as long every period is on a bus that cannot keep up.
+    fn stretch(&self) -> f64 {
+        let (mut kept, mut missed) = (1e6, 1.0);
+        while kept / missed > 1.0001 {
+            let between = f64::sqrt(kept * missed);
+            if self.load_at(between) <= 1.0 { kept = between } else { missed = between }
+        }
+        kept
     }
 
     /// The longest request that may be on the wire when something comes.

@@ -1,17 +1,20 @@
 //! Whether the watchdogs and heartbeats of devices are fed in time, also while another device is silent.
 //!
-//! A watchdog is fed by any request to its device, so at least as often as the device's most frequent
-//! read; and three times within its time, where that is known. What may come between: a read of everything
-//! else that is due at the same moment; and of one that has just fallen silent the
-//! wait for its answer, as long again in which the line is left alone, and a round of everything else that
-//! has become due meanwhile.
+//! A watchdog is fed by any request to its device: by its most frequent poll, and where that is too seldom
+//! by a read that the program makes when a third of the watchdog's time has passed. Where the configuration
+//! does not say what that time is, only the polls are counted. What may come between: a read of everything
+//! else that is due at the same moment; other watchdogs and heartbeats; and of a device that has just fallen
+//! silent the wait for its answer, as long again in which the line is left alone, and a round of everything
+//! else that has become due meanwhile. Commands are not counted: they put a feeding off until two thirds of
+//! the time have passed, and no further.
 
 use serde::Serialize;
 
 use super::budget::Budget;
 use super::{advice, told};
 use crate::engine::codec;
-use crate::engine::device::PointIndex;
+use crate::engine::device::{Point, PointIndex};
+use crate::engine::plan::Cost;
 use crate::engine::settings::{Bus, DeviceSettings};
 use crate::engine::time::Duration;
 use crate::engine::value::Reading;
@@ -30,31 +33,65 @@ pub struct Delays {
     /// The request that is on the wire when something comes; and all that is read again and again, once.
     one_request: f64,
     round: f64,
-    /// A request that nobody answers, and the silence after it.
+    /// What other watchdogs and heartbeats may send first, if all are due at once.
+    others_fed: f64,
+    /// And this device's own heartbeats.
+    own_beats: f64,
+    /// A request that nobody answers, the silence after it, and what is left of the silence after the one
+    /// before it.
     one_silent: f64,
-    /// How much of that is the response timeout, and how often it counts.
+    /// The response timeout, and whether a line is left alone for as long again.
     timeout: f64,
-    timeouts: f64,
+    is_line: bool,
 }
 
 impl Delays {
-    pub fn of(bus: &Bus, settings: &DeviceSettings, asked_every: Option<f64>, budget: &Budget) -> Delays {
+    /// `device` is its number on the bus.
+    pub fn of(
+        bus: &Bus,
+        settings: &DeviceSettings,
+        device: usize,
+        asked_every: Option<f64>,
+        budget: &Budget,
+    ) -> Delays {
+        let others = budget.wants.iter().enumerate().filter(|(other, _)| *other != device);
+        let fed = |wants: &Wants| wants.fed_every.map_or(0.0, |_| budget.longest()) + wants.time_of_beats();
         let demanded = settings.device.wire.response_timeout.unwrap_or_default();
+        let timeout = bus.response_timeout.max(demanded).as_secs_f64();
+        let is_line = bus.link.line().is_some();
         Delays {
             asked_every,
             one_request: budget.longest(),
             round: budget.round(),
-            one_silent: budget.one_silent.max(budget.longest()),
-            timeout: bus.response_timeout.max(demanded).as_secs_f64(),
-            timeouts: if bus.link.line().is_some() { 2.0 } else { 1.0 },
+            others_fed: others.map(|(_, wants)| fed(wants)).sum(),
+            own_beats: budget.wants[device].time_of_beats(),
+            one_silent: (budget.one_silent + repeated(timeout, is_line)).max(budget.longest()),
+            timeout,
+            is_line,
         }
     }
 
     /// The response timeout with which the rest is over in `time`, if there is a sensible one.
     fn timeout_for(&self, time: f64, every_one_silent: f64) -> Option<Duration> {
-        let wanted = self.timeout - (every_one_silent - time) / self.timeouts;
+        let silent = |timeout: f64| timeout * 2.0 + repeated(timeout, true);
+        let wanted = if self.is_line {
+            // As much less silence as it takes, with the repeat or already without one.
+            let left = silent(self.timeout) - (every_one_silent - time);
+            if left > silent(REPEATED_AFTER) { (left + REPEATED_AFTER) / 3.0 } else { left / 2.0 }
+        } else {
+            self.timeout - (every_one_silent - time)
+        };
         (wanted >= SHORTEST_TIMEOUT).then(|| advice::round_down(Duration::from_secs_f64(wanted)))
     }
+}
+
+/// A device that has not answered is asked again so soon at the earliest.
+const REPEATED_AFTER: f64 = 0.24;
+
+/// On a serial line its next request may be decided while the line is still left alone after the last one,
+/// and wait for the rest of that; what is due meanwhile comes after it.
+fn repeated(timeout: f64, is_line: bool) -> f64 {
+    if is_line { (timeout - REPEATED_AFTER).max(0.0) } else { 0.0 }
 }
 
 /// A response timeout that no device should be offered less than.
@@ -83,32 +120,91 @@ pub struct Feeding {
 pub fn of_device(settings: &DeviceSettings, delays: Delays) -> Vec<Feeding> {
     let device = &settings.device;
     let mut all = Vec::new();
-    if let (Some(point), Some(asked_every)) = (device.wire.watchdog, delays.asked_every) {
+    if let Some(point) = device.wire.watchdog {
         let time = declared_seconds(settings, point);
         // After a third of a time that is known it is fed before anything else is polled.
         let due = time.filter(|time| *time > 0.0).map_or(f64::INFINITY, |time| time / HEARTBEATS_WITHIN);
         // Otherwise one may be on the wire and everything else be due when it is due, and the device that
         // is silent among that.
+        let asked_every = delays.asked_every.unwrap_or(f64::INFINITY);
         let polled_every = asked_every + delays.one_request + delays.round;
-        let every = [
-            polled_every.min(due + delays.one_request),
-            (polled_every + delays.one_silent).min(due + delays.one_silent),
-        ];
-        let enough = (polled_every + delays.one_silent).min(delays.one_silent * LONGER);
-        all.push(Feeding::new(settings, point, "watchdog", time, every, enough, delays));
+        let [before, before_one_silent] =
+            [delays.one_request, delays.one_silent].map(|delay| delay + delays.others_fed);
+        let every =
+            [polled_every.min(due + before), (polled_every + delays.one_silent).min(due + before_one_silent)];
+        let enough = (polled_every + delays.one_silent).min(before_one_silent * LONGER);
+        // Nothing can be said where nothing is polled again and again and its time is not known.
+        if every[0].is_finite() {
+            all.push(Feeding::new(settings, point, "watchdog", time, every, enough, delays));
+        }
     }
-    let mut times: Vec<PointIndex> = device.points.iter().filter_map(|point| point.heartbeat).collect();
-    times.dedup();
-    for point in times {
+    for point in times_of_heartbeats(settings) {
         let time = declared_seconds(settings, point);
         // What is read and written is two requests, and what may go before each of them.
         let due = time.unwrap_or_default() / HEARTBEATS_WITHIN;
-        let every =
-            [delays.one_request, delays.one_silent].map(|delay| due + delay + 3.0 * delays.one_request);
-        let enough = (delays.one_silent + 3.0 * delays.one_request) * LONGER;
+        let before = 3.0 * delays.one_request + delays.others_fed + delays.own_beats;
+        let every = [delays.one_request, delays.one_silent].map(|delay| due + delay + before);
+        let enough = (delays.one_silent + before) * LONGER;
         all.push(Feeding::new(settings, point, "heartbeat", time, every, enough, delays));
     }
     all
+}
+
+/// The points that hold how long a heartbeat may stay away, each once.
+fn times_of_heartbeats(settings: &DeviceSettings) -> Vec<PointIndex> {
+    let mut times: Vec<PointIndex> =
+        settings.device.points.iter().filter_map(|point| point.heartbeat).collect();
+    times.sort_unstable();
+    times.dedup();
+    times
+}
+
+/// What a device wants of the wire besides its polls, as far as the configuration says it.
+pub struct Wants {
+    /// The longest time without a request that its watchdog is left, in seconds.
+    pub fed_every: Option<f64>,
+    pub beats: Vec<Beat>,
+}
+
+/// A heartbeat: a register that is read and written again and again.
+pub struct Beat {
+    /// Seconds between two.
+    pub every: f64,
+    /// Both requests on the wire, in seconds.
+    pub time: f64,
+}
+
+/// The data of the request that writes one register, and of its answer, beyond those of a read.
+const BYTES_OF_WRITE: u64 = 3;
+
+impl Wants {
+    /// `cost`: of requests to this device.
+    pub fn of(settings: &DeviceSettings, cost: Cost) -> Wants {
+        let part = |time: PointIndex| {
+            let seconds = declared_seconds(settings, time)?;
+            (seconds > 0.0).then_some(seconds / HEARTBEATS_WITHIN)
+        };
+        let delay = settings.device.wire.limits.delay;
+        let beat = |point: &Point| {
+            let write = Duration::from_nanos(cost.request + BYTES_OF_WRITE * cost.byte);
+            let time = cost.time_of(point.at.span) + write + delay * 2;
+            Some(Beat { every: part(point.heartbeat?)?, time: time.as_secs_f64() })
+        };
+        Wants {
+            fed_every: settings.device.wire.watchdog.and_then(part),
+            beats: settings.device.points.iter().filter_map(beat).collect(),
+        }
+    }
+
+    /// Seconds of wire in a second.
+    pub fn load_of_beats(&self) -> f64 {
+        self.beats.iter().map(|beat| beat.time / beat.every).sum()
+    }
+
+    /// All of them once.
+    fn time_of_beats(&self) -> f64 {
+        self.beats.iter().map(|beat| beat.time).sum()
+    }
 }
 
 impl Feeding {

@@ -3,6 +3,7 @@
 mod advice;
 mod budget;
 mod feeding;
+mod round;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -96,7 +97,7 @@ struct BusSummary {
     link: String,
     /// `19200 8E1`, where there is a line.
     line: Option<String>,
-    /// Seconds of wire that the polls want in a second; above 1 every period is longer by as much.
+    /// Seconds of wire that polls, watchdogs and heartbeats want in a second; above 1 every period is longer by as much.
     load: f64,
     /// How long a command waits at most for a request in flight, in seconds: all devices answering.
     command_wait: f64,
@@ -242,7 +243,10 @@ impl BusSummary {
                 unit: settings.unit,
                 points: settings.device.points.len(),
                 polls,
-                feeding: feeding::of_device(settings, Delays::of(bus, settings, asked_every, &budget)),
+                feeding: feeding::of_device(
+                    settings,
+                    Delays::of(bus, settings, number, asked_every, &budget),
+                ),
             }
         };
         BusSummary {

@@ -403,6 +403,9 @@ impl DeviceState {
         self.publish_availability(false, context);
         self.values.lose_all(Missing::Offline);
         self.wake_reads();
+        // It is asked as after a connect, selectors first: what lived only in another mode than the device
+        // was in may not be answered at all.
+        self.polls.want_all();
         self.beats.stop();
         self.upkeep.forget();
         self.tell_all(now, context);

@@ -57,6 +57,8 @@ impl Bus {
                     continue;
                 }
                 self.pace.idle(now);
+                // No read has had to wait for what went out of turn.
+                self.ahead = 0;
                 return;
             };
             self.poll(device, polled);
