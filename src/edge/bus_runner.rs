@@ -20,9 +20,11 @@ use crate::engine::modbus::guard::Guard;
 use crate::engine::recorder::Recording;
 use crate::engine::request::Request;
 use crate::engine::settings::Settings;
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
+/// How often a bus is told the date.
+const DATE_EACH: Duration = Duration::from_secs(1);
 /// Looks that may wait for a bus.
 pub(super) const LOOKS_MAX: usize = 64;
 
@@ -71,6 +73,8 @@ pub(super) struct BusRunner {
     stopping: bool,
     /// Something has happened that may be of interest for how the gateway is.
     stirred: Arc<AtomicBool>,
+    /// When the bus was last told the date.
+    dated_at: Option<Time>,
     /// The link was opened since somebody asked.
     is_newly_open: bool,
     /// Whoever waits for the end hears of it, and of what is still being saved.
@@ -103,6 +107,7 @@ impl BusRunner {
             stop,
             stopping: false,
             stirred,
+            dated_at: None,
             is_newly_open: false,
             ended,
         }
@@ -176,7 +181,11 @@ impl BusRunner {
 
     fn handle(&mut self, event: Event) {
         let now = self.clock.now();
-        self.bus.set_date(now, self.clock.today());
+        // Somebody may set the clock; once in a second is often enough to notice it.
+        if self.dated_at.is_none_or(|dated_at| now - dated_at >= DATE_EACH) {
+            self.bus.set_date(now, self.clock.today());
+            self.dated_at = Some(now);
+        }
         self.bus.handle(now, event);
         self.perform();
     }

@@ -1,10 +1,11 @@
 //! What is known of a device's points, and what of it is worth telling.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use crate::engine::address::{Address, Span};
+use crate::engine::address::Address;
 use crate::engine::codec::{self, Raw};
-use crate::engine::device::{Device, Point, PointIndex, Poll};
+use crate::engine::device::{Device, Point, PointIndex};
 use crate::engine::plan::Read;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::{Missing, Reading};
@@ -21,7 +22,8 @@ pub struct Values {
     decides: Vec<bool>,
     /// What is missing, or why, has changed since it was last asked.
     missing_changed: bool,
-    /// What each poll brought last. Words that have not changed need not be understood again.
+    /// What each poll brought last. Words that have not changed need not be understood again, and cost
+    /// nothing for each point.
     heard: Vec<Heard>,
     /// Counts what makes equal words mean something else: a selector, a loss, a reading from elsewhere.
     meaning: u64,
@@ -30,10 +32,13 @@ pub struct Values {
 /// The words of a read, and the count of meanings under which they were understood.
 #[derive(Clone, Debug)]
 struct Heard {
-    span: Span,
-    poll: Poll,
+    read: Arc<Read>,
     meaning: u64,
     words: Vec<u16>,
+    /// When they last came.
+    at: Time,
+    /// As long as the same words come, nothing of them is to be told before.
+    told_until: Time,
 }
 
 #[derive(Clone, Debug)]
@@ -54,6 +59,8 @@ pub struct Absorbed {
     pub decided: bool,
     /// Points that hold a register value which the profile does not name, seen for the first time.
     pub unnamed: Vec<(PointIndex, i128)>,
+    /// The same came as before, and it is not yet time to tell any of it again.
+    pub is_told: bool,
 }
 
 impl Values {
@@ -105,7 +112,9 @@ impl Values {
     }
 
     pub fn read_at(&self, point: PointIndex) -> Option<Time> {
-        self.values[point].read_at
+        let holds = |heard: &&Heard| heard.read.points.iter().any(|(held, _)| *held == point);
+        let by_polls = self.heard.iter().filter(holds).map(|heard| heard.at);
+        by_polls.chain(self.values[point].read_at).max()
     }
 
     /// Whether other points, things or a heartbeat wait for this one.
@@ -115,25 +124,44 @@ impl Values {
 
     /// Takes in the words of a poll that began after every write before it. As [`Values::absorb`], but
     /// what has not changed since the poll before is not understood again.
-    pub fn absorb_poll(&mut self, now: Time, device: &Device, read: &Read, words: &[u16]) -> Absorbed {
-        let is_same = |heard: &Heard| heard.span == read.span && heard.poll == read.poll;
-        let before = match self.heard.iter().position(is_same) {
-            Some(at) => Some(self.heard.swap_remove(at)),
-            None => None,
-        };
+    pub fn absorb_poll(&mut self, now: Time, device: &Device, read: &Arc<Read>, words: &[u16]) -> Absorbed {
+        let at = self.heard.iter().position(|heard| Arc::ptr_eq(&heard.read, read));
+        if let Some(heard) = at.map(|at| &mut self.heard[at]) {
+            // Most polls bring what the one before has brought.
+            if heard.meaning == self.meaning && heard.words == words {
+                heard.at = now;
+                return Absorbed { is_told: now < heard.told_until, ..Absorbed::default() };
+            }
+        }
+        let before = at.map(|at| self.heard.swap_remove(at));
         let known = before.as_ref().filter(|heard| heard.meaning == self.meaning);
         let absorbed = self.take_in(now, device, read, words, known.map(|heard| &heard.words[..]));
         let mut heard = before.map_or(Vec::new(), |heard| heard.words);
         heard.clear();
         heard.extend_from_slice(words);
-        self.heard.push(Heard { span: read.span, poll: read.poll, meaning: self.meaning, words: heard });
+        let (read, meaning) = (read.clone(), self.meaning);
+        self.heard.push(Heard { read, meaning, words: heard, at: now, told_until: now });
         absorbed
+    }
+
+    /// All that a poll has just brought has been told as far as it is worth telling.
+    pub fn has_been_told(&mut self, read: &Arc<Read>, republish: Duration) {
+        let told_at = |(point, _): &(PointIndex, Address)| Some(self.values[*point].told.as_ref()?.1);
+        let oldest = read.points.iter().filter_map(told_at).min();
+        if let Some(heard) = self.heard.iter_mut().find(|heard| Arc::ptr_eq(&heard.read, read)) {
+            heard.told_until = oldest.map_or(heard.at, |oldest| oldest + republish);
+        }
     }
 
     /// The reads have changed. What one of them brought long ago may come again while others have brought
     /// something else since.
     pub fn forget_words(&mut self) {
-        self.heard.clear();
+        for heard in std::mem::take(&mut self.heard) {
+            for (point, _) in &heard.read.points {
+                let read_at = &mut self.values[*point].read_at;
+                *read_at = (*read_at).max(Some(heard.at));
+            }
+        }
     }
 
     /// Takes in the words of a read that began after every write before it. Selectors come first:
@@ -155,13 +183,6 @@ impl Values {
         before: Option<&[u16]>,
     ) -> Absorbed {
         let mut absorbed = Absorbed::default();
-        // Most polls bring what the one before has brought.
-        if before == Some(words) {
-            for (point, _) in &read.points {
-                self.values[*point].read_at = Some(now);
-            }
-            return absorbed;
-        }
         let meaning = self.meaning;
         for selectors in [true, false] {
             for (point, address) in &read.points {
