@@ -162,15 +162,19 @@ impl BusRunner {
         of_port.into_iter().chain(self.bus.wake_at()).min()
     }
 
-    /// Does what there is to do. `letters`: the bell has rung; `link`: there are bytes, or the link's time has
-    /// come.
-    pub(super) fn woken(&mut self, letters: bool, link: bool) {
+    /// Does what there is to do. `letters`: the bell has rung; `bytes`: the link has some.
+    pub(super) fn woken(&mut self, letters: bool, bytes: bool) {
         if letters {
             self.read_letters();
             self.stop_if_asked();
         }
-        // The bell rings also for a link that has opened.
-        if link || !matches!(self.port, Port::Open(_)) {
+        // The bell rings also for a link that has opened. Where it is only the bus's time that has come, there
+        // is nothing to be read.
+        let is_links_turn = match &self.port {
+            Port::Open(link) => bytes || link.wake_at().is_some_and(|at| self.clock.now() >= at),
+            Port::Closed | Port::Waiting(_) | Port::Opening(_) => true,
+        };
+        if is_links_turn {
             self.advance_port();
         }
         if self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {

@@ -192,7 +192,7 @@ fn run_alone(mut runner: BusRunner) {
         if woken.bell {
             runner.bell().silence();
         }
-        runner.woken(woken.bell, woken.link || !woken.bell);
+        runner.woken(woken.bell, woken.link);
     }
     runner.finish();
 }
@@ -276,7 +276,7 @@ impl SharedThread {
                 let is_heard = heard.iter().any(|event| event.data.u64() == numbered.number);
                 let is_due = numbered.wake_at.is_some_and(|at| woken_at >= Some(at));
                 if rung || is_heard || is_due {
-                    numbered.runner.woken(rung, is_heard || is_due);
+                    numbered.runner.woken(rung, is_heard);
                     numbered.settle(&self.epoll);
                 }
             }
