@@ -357,3 +357,80 @@ fn differs(told: &Reading, reading: &Reading, point: &Point) -> bool {
         _ => told.to_string() != reading.to_string(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::address::{Span, Table};
+    use crate::engine::device::Poll;
+    use crate::engine::test_device::device_of;
+
+    const REPUBLISH: Duration = Duration::from_secs(60);
+
+    fn two_registers() -> (Device, Arc<Read>) {
+        let at = |first| Address { span: Span::single(Table::Holding, first), bits: None };
+        let device =
+            device_of(vec![Point::new("one", at(0), Poll::Fast), Point::new("two", at(1), Poll::Fast)]);
+        let points = vec![(0, at(0)), (1, at(1))];
+        let span = Span::with_count(Table::Holding, 0, 2).expect("a span");
+        (device, Arc::new(Read { poll: Poll::Fast, span, points, alone: false }))
+    }
+
+    /// What of a poll at this second is told, as the bus goes about it.
+    fn told(
+        values: &mut Values,
+        device: &Device,
+        read: &Arc<Read>,
+        second: u64,
+        words: &[u16],
+    ) -> Vec<String> {
+        let now = Time::from_millis(second * 1000);
+        if values.absorb_poll(now, device, read, words).is_told {
+            return Vec::new();
+        }
+        let points = read.points.iter();
+        let told = points
+            .filter_map(|(point, _)| values.tell(now, *point, &device.points[*point], REPUBLISH, false))
+            .collect();
+        values.has_been_told(read, REPUBLISH);
+        told
+    }
+
+    #[test]
+    fn a_poll_that_brings_the_same_is_told_again_in_time_and_not_before() {
+        let (device, read) = two_registers();
+        let mut values = Values::new(&device);
+        for (second, words, expected) in [
+            (0, [1, 2], vec!["1", "2"]),
+            (10, [1, 2], vec![]),
+            (20, [1, 3], vec!["3"]),
+            (30, [1, 3], vec![]),
+            (59, [1, 3], vec![]),
+            (60, [1, 3], vec!["1"]),
+            (79, [1, 3], vec![]),
+            (80, [1, 3], vec!["3"]),
+        ] {
+            assert_eq!(told(&mut values, &device, &read, second, &words), expected, "{second}");
+        }
+        // What was lost meanwhile is told when it comes again, however much it is the same.
+        values.lose(1, Missing::Exception(4));
+        let now = Time::from_millis(81_000);
+        assert_eq!(values.tell(now, 1, &device.points[1], REPUBLISH, false).as_deref(), Some("None"));
+        assert_eq!(told(&mut values, &device, &read, 82, &[1, 3]), ["3"]);
+    }
+
+    #[test]
+    fn a_poll_that_brings_the_same_has_read_its_points_also_after_the_reads_have_changed() {
+        let (device, read) = two_registers();
+        let mut values = Values::new(&device);
+        assert_eq!(values.read_at(1), None);
+        for second in [0, 10] {
+            told(&mut values, &device, &read, second, &[1, 2]);
+            assert_eq!(values.read_at(1), Some(Time::from_millis(second * 1000)));
+        }
+        values.forget_words();
+        assert_eq!(values.read_at(1), Some(Time::from_millis(10_000)));
+        told(&mut values, &device, &two_registers().1, 20, &[1, 2]);
+        assert_eq!(values.read_at(0), Some(Time::from_millis(20_000)));
+    }
+}
