@@ -141,7 +141,7 @@ impl App {
 fn recall(plant: &Plant, state: &StateFiles) {
     if plant.settings().home_assistant.discovery {
         plant.mailbox().change(|outbox| {
-            state.announced().iter().for_each(|(topic, payload)| outbox.recall(topic, payload));
+            state.take_announced().iter().for_each(|(topic, payload)| outbox.recall(topic, payload));
         });
     }
 }

@@ -20,9 +20,11 @@ use crate::engine::modbus::guard::Guard;
 use crate::engine::recorder::Recording;
 use crate::engine::request::Request;
 use crate::engine::settings::Settings;
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
+/// How often a bus is told the date.
+const DATE_EACH: Duration = Duration::from_secs(1);
 /// Looks that may wait for a bus.
 pub(super) const LOOKS_MAX: usize = 64;
 
@@ -71,6 +73,8 @@ pub(super) struct BusRunner {
     stopping: bool,
     /// Something has happened that may be of interest for how the gateway is.
     stirred: Arc<AtomicBool>,
+    /// When the bus was last told the date.
+    dated_at: Option<Time>,
     /// The link was opened since somebody asked.
     is_newly_open: bool,
     /// Whoever waits for the end hears of it, and of what is still being saved.
@@ -103,6 +107,7 @@ impl BusRunner {
             stop,
             stopping: false,
             stirred,
+            dated_at: None,
             is_newly_open: false,
             ended,
         }
@@ -157,15 +162,19 @@ impl BusRunner {
         of_port.into_iter().chain(self.bus.wake_at()).min()
     }
 
-    /// Does what there is to do. `letters`: the bell has rung; `link`: there are bytes, or the link's time has
-    /// come.
-    pub(super) fn woken(&mut self, letters: bool, link: bool) {
+    /// Does what there is to do. `letters`: the bell has rung; `bytes`: the link has some.
+    pub(super) fn woken(&mut self, letters: bool, bytes: bool) {
         if letters {
             self.read_letters();
             self.stop_if_asked();
         }
-        // The bell rings also for a link that has opened.
-        if link || !matches!(self.port, Port::Open(_)) {
+        // The bell rings also for a link that has opened. Where it is only the bus's time that has come, there
+        // is nothing to be read.
+        let is_links_turn = match &self.port {
+            Port::Open(link) => bytes || link.wake_at().is_some_and(|at| self.clock.now() >= at),
+            Port::Closed | Port::Waiting(_) | Port::Opening(_) => true,
+        };
+        if is_links_turn {
             self.advance_port();
         }
         if self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
@@ -176,7 +185,11 @@ impl BusRunner {
 
     fn handle(&mut self, event: Event) {
         let now = self.clock.now();
-        self.bus.set_date(now, self.clock.today());
+        // Somebody may set the clock; once in a second is often enough to notice it.
+        if self.dated_at.is_none_or(|dated_at| now - dated_at >= DATE_EACH) {
+            self.bus.set_date(now, self.clock.today());
+            self.dated_at = Some(now);
+        }
         self.bus.handle(now, event);
         self.perform();
     }

@@ -193,7 +193,7 @@ fn run_alone(mut runner: BusRunner) {
         if woken.bell {
             runner.bell().silence();
         }
-        runner.woken(woken.bell, woken.link || !woken.bell);
+        runner.woken(woken.bell, woken.link);
     }
     runner.finish();
 }
@@ -272,12 +272,12 @@ impl SharedThread {
                 self.shared.bell.silence();
                 self.welcome();
             }
+            let woken_at = self.runners.first().map(|numbered| numbered.runner.clock().now());
             for numbered in &mut self.runners {
                 let is_heard = heard.iter().any(|event| event.data.u64() == numbered.number);
-                let runner = &mut numbered.runner;
-                let is_due = numbered.wake_at.is_some_and(|at| runner.clock().now() >= at);
+                let is_due = numbered.wake_at.is_some_and(|at| woken_at >= Some(at));
                 if rung || is_heard || is_due {
-                    runner.woken(rung, is_heard || is_due);
+                    numbered.runner.woken(rung, is_heard);
                     numbered.settle(&self.epoll);
                 }
             }

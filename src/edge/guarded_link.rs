@@ -39,13 +39,20 @@ impl GuardedLink {
         timeout: Duration,
         tape: &mut Tape,
     ) -> Result<Option<Reply>, Lost> {
-        let reply = self.guard.begin(self.clock.now(), request, timeout);
-        self.not_before = if reply.is_none() { Some(not_before) } else { None };
-        match (&self.guard, self.send_at()) {
+        let now = self.clock.now();
+        let reply = self.guard.begin(now, request, timeout);
+        if reply.is_some() {
+            self.not_before = None;
+            return usable(reply);
+        }
+        self.not_before = Some(not_before);
+        if now < not_before.max(self.guard.earliest_send(now)) {
+            return Ok(None);
+        }
+        match &self.guard {
             // What is still to be read belongs to older transactions, and says so.
-            (Guard::Tcp(_), Some(at)) if self.clock.now() >= at => self.send_or_wake(tape),
-            (Guard::Rtu(_), Some(at)) if self.clock.now() >= at => self.advance(tape),
-            _ => usable(reply),
+            Guard::Tcp(_) => self.send_or_wake(tape),
+            Guard::Rtu(_) => self.advance(tape),
         }
     }
 

@@ -5,6 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -34,8 +35,10 @@ pub struct StateFiles {
     desk: Arc<Desk>,
     thread: Mutex<Option<JoinHandle<()>>>,
     keeps: bool,
-    /// What Home Assistant was last told, by topic, as it is stored.
-    announced: Mutex<BTreeMap<String, String>>,
+    /// What an earlier run has told Home Assistant, by topic, until somebody takes it.
+    recalled: Mutex<BTreeMap<String, String>>,
+    /// The fingerprint of what is stored of that: the whole lies in the outbox already.
+    announced: Mutex<u64>,
     /// Held as long as this lives.
     _lock: Option<File>,
 }
@@ -70,6 +73,7 @@ impl StateFiles {
             desk: Arc::default(),
             thread: Mutex::default(),
             keeps: false,
+            recalled: Mutex::default(),
             announced: Mutex::default(),
             _lock: lock,
         }
@@ -105,6 +109,8 @@ impl StateFiles {
             // They may find room where a damaged memory must not be overwritten.
             return Ok(StateFiles::unkept(memories, Some(state_dir.join("recordings")), lock));
         }
+        let recalled = recall_announced(&state_dir.join(ANNOUNCED));
+        let announced = fingerprint(recalled.iter().map(|(topic, payload)| (&**topic, &**payload)));
         let desk = Arc::<Desk>::default();
         let (of_thread, of_files) = (desk.clone(), folder.clone());
         let thread = std::thread::Builder::new()
@@ -119,7 +125,8 @@ impl StateFiles {
             desk,
             thread: Mutex::new(Some(thread)),
             keeps: true,
-            announced: Mutex::new(recall_announced(&state_dir.join(ANNOUNCED))),
+            recalled: Mutex::new(recalled),
+            announced: Mutex::new(announced),
             _lock: lock,
         })
     }
@@ -165,20 +172,24 @@ impl StateFiles {
         }
     }
 
-    /// What an earlier run has told Home Assistant, by topic.
-    pub fn announced(&self) -> BTreeMap<String, String> {
-        lock(&self.announced).clone()
+    /// What an earlier run has told Home Assistant, by topic; only once.
+    pub fn take_announced(&self) -> BTreeMap<String, String> {
+        std::mem::take(&mut lock(&self.recalled))
     }
 
     /// Keeps what Home Assistant has been told, if it is not what is kept. Does not wait for that.
     pub fn store_announced(&self, told: &BTreeMap<&str, &str>) {
-        let mut announced = lock(&self.announced);
-        let as_stored = announced.iter().map(|(topic, payload)| (topic.as_str(), payload.as_str()));
-        if !self.keeps || as_stored.eq(told.iter().map(|(topic, payload)| (*topic, *payload))) {
+        if !self.keeps {
             return;
         }
-        *announced = told.iter().map(|(topic, payload)| (topic.to_string(), payload.to_string())).collect();
-        self.desk.lock().announced = Some(serde_json::json!(*announced).to_string());
+        let next = fingerprint(told.iter().map(|(topic, payload)| (*topic, *payload)));
+        if std::mem::replace(&mut *lock(&self.announced), next) == next {
+            return;
+        }
+        match serde_json::to_string(told) {
+            Ok(text) => self.desk.lock().announced = Some(text),
+            Err(error) => tracing::error!("what is announced cannot be stored: {error}"),
+        }
         self.desk.changed.notify_all();
     }
 
@@ -306,6 +317,12 @@ fn recall_announced(path: &Path) -> BTreeMap<String, String> {
         tracing::warn!("`{}` cannot be used ({reason}) and will be written anew", path.display());
         BTreeMap::new()
     })
+}
+
+fn fingerprint<'a>(announced: impl Iterator<Item = (&'a str, &'a str)>) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    announced.for_each(|one| one.hash(&mut hasher));
+    hasher.finish()
 }
 
 /// Renames a damaged file to one with `.broken` behind its name, which replaces no other.
@@ -455,18 +472,18 @@ mod tests {
         let open = || StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
         let path = folder.path().join(ANNOUNCED);
         let files = open();
-        assert_eq!(files.announced(), BTreeMap::new());
+        assert_eq!(files.take_announced(), BTreeMap::new());
         files.store_announced(&BTreeMap::from([("a/config", "{}")]));
         drop(files);
         let files = open();
-        assert_eq!(files.announced(), BTreeMap::from([("a/config".to_string(), "{}".to_string())]));
+        assert_eq!(files.take_announced(), BTreeMap::from([("a/config".to_string(), "{}".to_string())]));
         // What is the same is not written again: it may lie on a memory card.
         fs::remove_file(&path).expect("it is there");
         files.store_announced(&BTreeMap::from([("a/config", "{}")]));
         drop(files);
         assert!(!path.exists());
         fs::write(&path, "{\"a/config\": 7").expect("a file");
-        assert_eq!(open().announced(), BTreeMap::new(), "a damaged one is as none");
+        assert_eq!(open().take_announced(), BTreeMap::new(), "a damaged one is as none");
     }
 
     #[test]

@@ -227,7 +227,9 @@ impl Outbox {
         self.dropped
     }
 
-    fn push_retained(&mut self, message: Message) {
+    fn push_retained(&mut self, mut message: Message) {
+        // It is kept, and text that was written bit by bit has room for as much again.
+        message.payload.shrink_to_fit();
         if let Some(entry) = self.retained.get_mut(&*message.topic) {
             entry.payload = message.payload;
             if !std::mem::replace(&mut entry.queued, true) {

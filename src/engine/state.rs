@@ -1,10 +1,11 @@
 //! What is known of a device's points, and what of it is worth telling.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use crate::engine::address::{Address, Span};
+use crate::engine::address::Address;
 use crate::engine::codec::{self, Raw};
-use crate::engine::device::{Device, Point, PointIndex, Poll};
+use crate::engine::device::{Device, Point, PointIndex};
 use crate::engine::plan::Read;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::{Missing, Reading};
@@ -21,7 +22,8 @@ pub struct Values {
     decides: Vec<bool>,
     /// What is missing, or why, has changed since it was last asked.
     missing_changed: bool,
-    /// What each poll brought last. Words that have not changed need not be understood again.
+    /// What each poll brought last. Words that have not changed need not be understood again, and cost
+    /// nothing for each point.
     heard: Vec<Heard>,
     /// Counts what makes equal words mean something else: a selector, a loss, a reading from elsewhere.
     meaning: u64,
@@ -30,10 +32,13 @@ pub struct Values {
 /// The words of a read, and the count of meanings under which they were understood.
 #[derive(Clone, Debug)]
 struct Heard {
-    span: Span,
-    poll: Poll,
+    read: Arc<Read>,
     meaning: u64,
     words: Vec<u16>,
+    /// When they last came.
+    at: Time,
+    /// As long as the same words come, nothing of them is to be told before.
+    told_until: Time,
 }
 
 #[derive(Clone, Debug)]
@@ -54,6 +59,8 @@ pub struct Absorbed {
     pub decided: bool,
     /// Points that hold a register value which the profile does not name, seen for the first time.
     pub unnamed: Vec<(PointIndex, i128)>,
+    /// The same came as before, and it is not yet time to tell any of it again.
+    pub is_told: bool,
 }
 
 impl Values {
@@ -105,7 +112,9 @@ impl Values {
     }
 
     pub fn read_at(&self, point: PointIndex) -> Option<Time> {
-        self.values[point].read_at
+        let holds = |heard: &&Heard| heard.read.points.iter().any(|(held, _)| *held == point);
+        let by_polls = self.heard.iter().filter(holds).map(|heard| heard.at);
+        by_polls.chain(self.values[point].read_at).max()
     }
 
     /// Whether other points, things or a heartbeat wait for this one.
@@ -115,25 +124,44 @@ impl Values {
 
     /// Takes in the words of a poll that began after every write before it. As [`Values::absorb`], but
     /// what has not changed since the poll before is not understood again.
-    pub fn absorb_poll(&mut self, now: Time, device: &Device, read: &Read, words: &[u16]) -> Absorbed {
-        let is_same = |heard: &Heard| heard.span == read.span && heard.poll == read.poll;
-        let before = match self.heard.iter().position(is_same) {
-            Some(at) => Some(self.heard.swap_remove(at)),
-            None => None,
-        };
+    pub fn absorb_poll(&mut self, now: Time, device: &Device, read: &Arc<Read>, words: &[u16]) -> Absorbed {
+        let at = self.heard.iter().position(|heard| Arc::ptr_eq(&heard.read, read));
+        if let Some(heard) = at.map(|at| &mut self.heard[at]) {
+            // Most polls bring what the one before has brought.
+            if heard.meaning == self.meaning && heard.words == words {
+                heard.at = now;
+                return Absorbed { is_told: now < heard.told_until, ..Absorbed::default() };
+            }
+        }
+        let before = at.map(|at| self.heard.swap_remove(at));
         let known = before.as_ref().filter(|heard| heard.meaning == self.meaning);
         let absorbed = self.take_in(now, device, read, words, known.map(|heard| &heard.words[..]));
         let mut heard = before.map_or(Vec::new(), |heard| heard.words);
         heard.clear();
         heard.extend_from_slice(words);
-        self.heard.push(Heard { span: read.span, poll: read.poll, meaning: self.meaning, words: heard });
+        let (read, meaning) = (read.clone(), self.meaning);
+        self.heard.push(Heard { read, meaning, words: heard, at: now, told_until: now });
         absorbed
+    }
+
+    /// All that a poll has just brought has been told as far as it is worth telling.
+    pub fn has_been_told(&mut self, read: &Arc<Read>, republish: Duration) {
+        let told_at = |(point, _): &(PointIndex, Address)| Some(self.values[*point].told.as_ref()?.1);
+        let oldest = read.points.iter().filter_map(told_at).min();
+        if let Some(heard) = self.heard.iter_mut().find(|heard| Arc::ptr_eq(&heard.read, read)) {
+            heard.told_until = oldest.map_or(heard.at, |oldest| oldest + republish);
+        }
     }
 
     /// The reads have changed. What one of them brought long ago may come again while others have brought
     /// something else since.
     pub fn forget_words(&mut self) {
-        self.heard.clear();
+        for heard in std::mem::take(&mut self.heard) {
+            for (point, _) in &heard.read.points {
+                let read_at = &mut self.values[*point].read_at;
+                *read_at = (*read_at).max(Some(heard.at));
+            }
+        }
     }
 
     /// Takes in the words of a read that began after every write before it. Selectors come first:
@@ -155,13 +183,6 @@ impl Values {
         before: Option<&[u16]>,
     ) -> Absorbed {
         let mut absorbed = Absorbed::default();
-        // Most polls bring what the one before has brought.
-        if before == Some(words) {
-            for (point, _) in &read.points {
-                self.values[*point].read_at = Some(now);
-            }
-            return absorbed;
-        }
         let meaning = self.meaning;
         for selectors in [true, false] {
             for (point, address) in &read.points {
@@ -334,5 +355,82 @@ fn differs(told: &Reading, reading: &Reading, point: &Point) -> bool {
         (Some(before), Some(after), Some(deadband)) => (after - before).abs() >= deadband.to_f64(),
         // Compared as told: the reason why something is missing belongs to the device's info.
         _ => told.to_string() != reading.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::address::{Span, Table};
+    use crate::engine::device::Poll;
+    use crate::engine::test_device::device_of;
+
+    const REPUBLISH: Duration = Duration::from_secs(60);
+
+    fn two_registers() -> (Device, Arc<Read>) {
+        let at = |first| Address { span: Span::single(Table::Holding, first), bits: None };
+        let device =
+            device_of(vec![Point::new("one", at(0), Poll::Fast), Point::new("two", at(1), Poll::Fast)]);
+        let points = vec![(0, at(0)), (1, at(1))];
+        let span = Span::with_count(Table::Holding, 0, 2).expect("a span");
+        (device, Arc::new(Read { poll: Poll::Fast, span, points, alone: false }))
+    }
+
+    /// What of a poll at this second is told, as the bus goes about it.
+    fn told(
+        values: &mut Values,
+        device: &Device,
+        read: &Arc<Read>,
+        second: u64,
+        words: &[u16],
+    ) -> Vec<String> {
+        let now = Time::from_millis(second * 1000);
+        if values.absorb_poll(now, device, read, words).is_told {
+            return Vec::new();
+        }
+        let points = read.points.iter();
+        let told = points
+            .filter_map(|(point, _)| values.tell(now, *point, &device.points[*point], REPUBLISH, false))
+            .collect();
+        values.has_been_told(read, REPUBLISH);
+        told
+    }
+
+    #[test]
+    fn a_poll_that_brings_the_same_is_told_again_in_time_and_not_before() {
+        let (device, read) = two_registers();
+        let mut values = Values::new(&device);
+        for (second, words, expected) in [
+            (0, [1, 2], vec!["1", "2"]),
+            (10, [1, 2], vec![]),
+            (20, [1, 3], vec!["3"]),
+            (30, [1, 3], vec![]),
+            (59, [1, 3], vec![]),
+            (60, [1, 3], vec!["1"]),
+            (79, [1, 3], vec![]),
+            (80, [1, 3], vec!["3"]),
+        ] {
+            assert_eq!(told(&mut values, &device, &read, second, &words), expected, "{second}");
+        }
+        // What was lost meanwhile is told when it comes again, however much it is the same.
+        values.lose(1, Missing::Exception(4));
+        let now = Time::from_millis(81_000);
+        assert_eq!(values.tell(now, 1, &device.points[1], REPUBLISH, false).as_deref(), Some("None"));
+        assert_eq!(told(&mut values, &device, &read, 82, &[1, 3]), ["3"]);
+    }
+
+    #[test]
+    fn a_poll_that_brings_the_same_has_read_its_points_also_after_the_reads_have_changed() {
+        let (device, read) = two_registers();
+        let mut values = Values::new(&device);
+        assert_eq!(values.read_at(1), None);
+        for second in [0, 10] {
+            told(&mut values, &device, &read, second, &[1, 2]);
+            assert_eq!(values.read_at(1), Some(Time::from_millis(second * 1000)));
+        }
+        values.forget_words();
+        assert_eq!(values.read_at(1), Some(Time::from_millis(10_000)));
+        told(&mut values, &device, &two_registers().1, 20, &[1, 2]);
+        assert_eq!(values.read_at(0), Some(Time::from_millis(20_000)));
     }
 }

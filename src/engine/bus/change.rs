@@ -17,6 +17,7 @@ impl Bus {
     pub(super) fn retire(&mut self, name: &str) {
         if let Some(index) = self.devices.iter().position(|device| device.name() == name) {
             self.devices[index].is_leaving = true;
+            self.is_anyone_leaving = true;
             self.refuse_all_of(index);
         }
     }
@@ -47,6 +48,9 @@ impl Bus {
 
     /// Lets go of the devices that leave and have nothing on the wire any more.
     pub(super) fn end_retirements(&mut self) {
+        if !self.is_anyone_leaving {
+            return;
+        }
         let asked = self.in_flight.as_ref().and_then(|in_flight| in_flight.device);
         let commanded = self.active.as_ref().map(|active| active.device);
         for index in (0..self.devices.len()).rev() {
@@ -62,6 +66,7 @@ impl Bus {
             }
             self.renumber(|other| if other > index { other - 1 } else { other });
         }
+        self.is_anyone_leaving = self.devices.iter().any(|device| device.is_leaving);
     }
 
     /// Everything that names a device by its number; nothing names one that is gone.
@@ -91,6 +96,7 @@ impl Bus {
             }
             self.devices.push(device);
         }
+        self.context.has_to_remember = true;
         self.look_what_they_have();
     }
 }

@@ -17,6 +17,8 @@ pub(super) struct Context {
     pub(super) json: bool,
     pub(super) bus_name: String,
     pub(super) republish: Duration,
+    /// Some device has something new to be stored.
+    pub(super) has_to_remember: bool,
     /// A moment, and its date as far as that is known.
     pub(super) date: Option<(Time, Date)>,
 }
@@ -30,6 +32,7 @@ impl Context {
             json: settings.mqtt.json,
             bus_name: bus_name.to_string(),
             republish: settings.republish,
+            has_to_remember: false,
             date: None,
         }
     }
@@ -42,10 +45,11 @@ impl Context {
         self.gateway.topics.of_device(&self.bus_name, device)
     }
 
-    /// The date at a time that has passed.
+    /// The date at a time.
     pub(super) fn date_of(&self, time: Time) -> Option<Date> {
-        let (now, date) = self.date?;
-        Some(Date(date.0.saturating_sub((now - time).as_secs())))
+        let (known_at, date) = self.date?;
+        // One of the two differences is nothing.
+        Some(Date((date + time.since(known_at)).0.saturating_sub(known_at.since(time).as_secs())))
     }
 
     pub(super) fn say(&mut self, severity: Severity, text: String) {

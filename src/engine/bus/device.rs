@@ -448,8 +448,15 @@ impl DeviceState {
             Ok(answer) => {
                 self.polls.end(index);
                 let read = self.polls.shared_read(index);
-                let absorbed = self.values.absorb_poll(now, &self.settings.device, &read, &words_of(&answer));
-                self.learn(now, &read, absorbed, context);
+                let words = match answer {
+                    Answer::Words(words) => words,
+                    bits => words_of(&bits),
+                };
+                let absorbed = self.values.absorb_poll(now, &self.settings.device, &read, &words);
+                if !absorbed.is_told || !self.tell_anyway.is_empty() {
+                    self.learn(now, &read, absorbed, context);
+                    self.values.has_been_told(&read, context.republish);
+                }
             }
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
@@ -476,8 +483,9 @@ impl DeviceState {
         let suspects = if code == 2 { read.refused() } else { Vec::new() };
         if !suspects.is_empty() {
             self.refused.extend(suspects);
-            self.keeping.has_changed();
+            self.keeping.has_changed(context);
             let reads = self.plan();
+            self.values.forget_words();
             let values = &self.values;
             self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
             self.wake_reads();

@@ -121,6 +121,9 @@ pub enum Severity {
     Warning,
 }
 
+/// So many actions find room that no memory is asked for.
+const ACTIONS_KEPT: usize = 16;
+
 /// One serial line or TCP connection, and the devices on it.
 pub struct Bus {
     name: String,
@@ -165,6 +168,7 @@ pub struct Bus {
     /// them costs more than everything else.
     feeds: bool,
     has_settings: bool,
+    is_anyone_leaving: bool,
     now: Time,
 }
 
@@ -267,6 +271,7 @@ impl Bus {
             record_due_at,
             feeds,
             has_settings,
+            is_anyone_leaving: false,
             now,
         }
     }
@@ -316,13 +321,19 @@ impl Bus {
 
     /// Takes the next thing to do, until there is none.
     pub fn next_action(&mut self) -> Option<Action> {
-        self.context.actions.pop_front()
+        let action = self.context.actions.pop_front();
+        if action.is_none() {
+            // At the start every value was in it at once.
+            self.context.actions.shrink_to(ACTIONS_KEPT);
+        }
+        action
     }
 
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let wholes = self.devices.iter().filter(|_| self.context.json).filter_map(DeviceState::whole_due_at);
+        let tell_wholes = if self.context.json { &self.devices[..] } else { &[] };
+        let wholes = tell_wholes.iter().filter_map(DeviceState::whole_due_at);
         let records = self.record_due_at.into_iter().chain(self.recorder.due_at()).chain(wholes);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
             return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
@@ -519,6 +530,10 @@ impl Bus {
     }
 
     fn remember(&mut self) {
+        let is_due = self.record_due_at.is_some_and(|due| self.now >= due);
+        if !std::mem::take(&mut self.context.has_to_remember) && !is_due && !self.stopping {
+            return;
+        }
         for device in &mut self.devices {
             if let Some(record) = device.record(self.now, self.stopping) {
                 self.context.actions.push_back(Action::Store(record));

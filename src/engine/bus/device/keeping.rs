@@ -29,8 +29,8 @@ pub(super) struct Keeping {
 
 impl Keeping {
     /// Something that is remembered has changed.
-    pub(super) fn has_changed(&mut self) {
-        self.changed = true;
+    pub(super) fn has_changed(&mut self, context: &mut Context) {
+        (self.changed, context.has_to_remember) = (true, true);
     }
 }
 
@@ -100,7 +100,7 @@ impl DeviceState {
             context.say(severity, format!("device {}: {}", self.settings.name, note.text));
         }
         if self.upkeep.take_settled_changed() {
-            self.keeping.changed = true;
+            self.keeping.has_changed(context);
             self.keeping.not_before = self.keeping.not_before.min(now + STORE_SETTLED_AFTER);
         }
         self.upkeep.take_drift_changed()

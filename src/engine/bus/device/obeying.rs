@@ -150,7 +150,7 @@ impl DeviceState {
         self.counters.writes += 1;
         if self.details(point).persistent {
             self.counters.persistent_writes += 1;
-            self.keeping.has_changed();
+            self.keeping.has_changed(context);
             self.wear.spend(now, point);
         }
         if self.values.is_selector(point) {
