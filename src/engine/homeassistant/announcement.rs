@@ -227,7 +227,7 @@ fn diagnostics(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> C
     let (topic, entity, key, object) = (own.health(), &device.name, "wire_", "value_json");
     let place = Place { identity, entity, key, topic: &topic, object };
     let mut components = place.times(&["turnaround_p95"]);
-    for (class, name) in [(Poll::Fast, "Fast period"), (Poll::Slow, "Slow period")] {
+    for (class, name) in [(Poll::Fast, "Period of fast polls"), (Poll::Slow, "Period of slow polls")] {
         if device.device.points.iter().any(|point| point.poll == class) {
             components.push(place.period(class.name(), name, class == Poll::Fast));
         }
@@ -412,16 +412,17 @@ mod tests {
         assert!(wire().all(|(_, component)| component["entity_category"] == "diagnostic"));
         let expected = json!({
             "platform": "sensor",
-            "name": "Turnaround, 95 %",
+            "name": "Turnaround, 95th percentile",
             "entity_category": "diagnostic",
             "device_class": "duration",
-            "unit_of_measurement": "s",
+            "unit_of_measurement": "ms",
             "state_class": "measurement",
-            "suggested_display_precision": 3,
+            "suggested_display_precision": 1,
             "unique_id": "busker_heating_wire_turnaround_p95",
             "default_entity_id": "sensor.heating_wire_turnaround_p95",
             "state_topic": "busker/heating/health",
-            "value_template": "{{ value_json.turnaround_seconds.p95 }}",
+            "value_template": "{{ (value_json.turnaround_seconds.p95 * 1000) | round(2) \
+                               if value_json.turnaround_seconds.p95 is not none else none }}",
         });
         assert_eq!(components["wire_turnaround_p95"], expected);
     }
