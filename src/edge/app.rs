@@ -18,7 +18,7 @@ use crate::edge::runtime::Runtime;
 use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
-use crate::engine::health::{self, GatewayReport};
+use crate::engine::health::{self, BusReport, DeviceReport, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
 use crate::engine::profile::Library;
 use crate::engine::settings::Settings;
@@ -248,6 +248,7 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
     let (rounds_to_tell, rounds_to_ask) = (rounds(TELL_HEALTH_EVERY), rounds(watchdog.min(ASK_EVERY)));
     let mut ticks = tokio::time::interval(every);
     let mut told: Option<Vec<bool>> = None;
+    let mut told_at: Vec<String> = Vec::new();
     let mut told_info = info(&plant.settings(), &plant.topics());
     let mut seen = None;
     let mut responding = true;
@@ -269,11 +270,17 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
         }
         let (topics, mailbox) = (plant.topics(), plant.mailbox());
         let states = states(&report);
-        if round % rounds_to_tell == 0 || told.as_ref() != Some(&states) {
+        let of_device =
+            |(bus, device): (&BusReport, &DeviceReport)| topics.of_device(&bus.name, &device.name).health();
+        let places: Vec<String> = report.devices().map(of_device).chain([topics.bridge_health()]).collect();
+        // After a reload a device may be new, or tell it elsewhere.
+        let is_time = round % rounds_to_tell == 0 || told_at != places;
+        told_at = places;
+        if is_time || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
         }
-        if round % rounds_to_tell == 0 {
+        if is_time {
             for (bus, device) in report.devices() {
                 let health = device.health_json(&bus.name).to_string();
                 mailbox.push(Message::retained(topics.of_device(&bus.name, &device.name).health(), health));

@@ -116,8 +116,12 @@ fn factory_settings(device: &Device) -> Vec<Option<i128>> {
 }
 
 fn payload(device: &Device, known: &[Option<i128>]) -> Value {
-    let gateway =
-        Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into(), release: Release::USUAL };
+    let gateway = Gateway {
+        topics: Topics::new("busker"),
+        prefix: "homeassistant".into(),
+        release: Release::USUAL,
+        retains: true,
+    };
     let settings = DeviceSettings {
         name: "device".into(),
         title: "Device".into(),

@@ -38,6 +38,9 @@ MOVES_ITSELF = re.compile(r"busker_metz_connect_mr_aio42_controller_\d_output")
 # busker says of it that another value stands there.
 IS_NOT_KEPT = {"busker_fuehlersysteme_sensor_pressure_zero_measure"}
 
+# From the factory it holds what nobody may write (manual, RWreg 65): it is shown, and refused.
+ONLY_SHOWN = {"busker_fuehlersysteme_sensor_display_turn": "0"}
+
 # What Home Assistant and its MQTT client may say themselves when their broker goes, and while it is away.
 BROKER_IS_AWAY = re.compile(
     r".*("
@@ -67,6 +70,36 @@ DO4, AI8, SI4, RELAY8, DIO42, VALVE = (
     f"busker_{name}" for name in ("metz_connect_mr_do4", "metz_connect_mr_ai8", "metz_connect_mr_si4",
                                   "fuehlersysteme_relay8", "metz_connect_mr_dio42", "test_valve")
 )
+BUS = "busker_bus_cellar"
+
+
+def counter(name: str) -> dict:
+    return facts("sensor", name=name, category="diagnostic", state_class="total_increasing", precision=0)
+
+
+def measured(name: str, unit: str, precision: int, device_class: str | None) -> dict:
+    return facts("sensor", name=name, category="diagnostic", state_class="measurement", unit=unit,
+                 precision=precision, device_class=device_class)
+
+
+# What they show of the wire when they have been asked a few times; commands have come by then.
+OF_WIRE = {
+    DO4 + "_wire_turnaround_p95": measured("Turnaround, 95th percentile", "ms", 1, "duration"),
+    DO4 + "_wire_fast_period": measured("Period of fast polls", "s", 2, "duration"),
+    DO4 + "_wire_timeouts": counter("Timeouts"),
+    BUS + "_link": facts("binary_sensor", name="Link", category="diagnostic", device_class="connectivity", state="on"),
+    BUS + "_load": measured("Load", "%", 1, None),
+    BUS + "_requests": counter("Requests"),
+    BUS + "_timeouts": counter("Timeouts"),
+    BUS + "_checksum_errors": counter("Checksum errors"),
+    BUS + "_exceptions": counter("Exceptions"),
+    BUS + "_late_replies": counter("Late replies"),
+    BUS + "_turnaround_p95": measured("Turnaround, 95th percentile", "ms", 1, "duration"),
+    BUS + "_command_wait_p95": measured("Wait of commands, 95th percentile", "ms", 1, "duration"),
+    "busker_bridge_connection": facts(
+        "binary_sensor", name="Connection", category="diagnostic", device_class="connectivity", state="on"
+    ),
+}
 EXPECTED = {
     **every(DO4 + "_relay_{}", range(1, 5), facts("switch", state="off")),
     **every(DO4 + "_relay_{}_hand", range(1, 5), facts("binary_sensor", category="diagnostic", state="off")),
@@ -94,6 +127,12 @@ EXPECTED = {
     RELAY8 + "_software": facts("sensor", category="diagnostic"),
     # A button has no state before it is pressed.
     RELAY8 + "_restart": facts("button", category="config", device_class="restart", known=False),
+    # How long something takes is told after a minute, and only if it has happened.
+    **{key: {fact: value for fact, value in wanted.items() if fact != "known"} for key, wanted in OF_WIRE.items()},
+    **{
+        f"{identity}_wire_{what}": {"category": "diagnostic"}
+        for identity in (AI8, SI4, RELAY8) for what in ("turnaround_p95", "fast_period", "timeouts")
+    },
 }
 
 
@@ -114,6 +153,8 @@ class House:
         self.home = Home(folder / "home-assistant", self.broker.port, ending)
         self.report = Report()
         self.report.about = {**self.home.about, "broker": broker_version()}
+        # What was heard by somebody who was there from the beginning, where the broker keeps no values.
+        self.witness: dict[str, str] | None = None
         # What is not as announced because the user wished so.
         self.own_ids: dict[str, str] = {}
 
@@ -121,6 +162,8 @@ class House:
         return self.by_identity[identity]
 
     def announced(self) -> dict[str, Announced]:
+        if self.witness is not None:
+            return announced(dict(self.witness))
         return announced(self.broker.retained([device.name for device in self.devices]))
 
     def settle(self, fresh: bool = False, patience: float = PATIENCE) -> dict[str, Announced]:
@@ -171,8 +214,7 @@ class House:
             if key in self.own_ids:
                 wanted[key]["entity_id"] = self.own_ids[key]
             if is_enabled:
-                # Of busker and its lines it is counters, which never hold still.
-                wanted[key] |= one.state_facts() if one.identity in self.by_identity else {"known": True}
+                wanted[key] |= one.state_facts()
         return wanted
 
     def is_asked_for(self, one: Announced) -> bool:
@@ -252,7 +294,9 @@ def main() -> None:
     began = time.monotonic()
     program, version, *steps = sys.argv[1:]
     only = [check for check in CHECKS if check.__name__ in steps]
-    with contextlib.ExitStack() as ending, tempfile.TemporaryDirectory(prefix="busker-ha-") as folder:
+    # All ends before its folder goes; what was killed may still write a little.
+    scratch = tempfile.TemporaryDirectory(prefix="busker-ha-", ignore_cleanup_errors=True)
+    with scratch as folder, contextlib.ExitStack() as ending:
         house = House(program, version, pathlib.Path(folder), ending)
         print(f"Home Assistant {house.home.about['home_assistant']}, {len(house.devices)} devices", flush=True)
         try:
@@ -278,7 +322,7 @@ def everything_is_there(house: House) -> None:
     """Exactly what is announced is there, each as it should be, and nothing is logged."""
     found = house.settle(fresh=True)
     house.home.wait(EXPECTED)
-    expected_of = {key: {other for other in EXPECTED if other.startswith(key)} for key in (DO4, AI8, SI4, RELAY8)}
+    expected_of = {key: {other for other in EXPECTED if other.startswith(key)} for key in (DO4, AI8, SI4, RELAY8, BUS, "busker_bridge")}
     for identity, expected in expected_of.items():
         enabled = {key for key, one in found.items() if one.identity == identity and one.enabled}
         same(enabled, expected, f"the enabled entities of {identity}")
@@ -309,6 +353,33 @@ def everything_is_enabled(house: House) -> None:
         "every disabled entity is enabled",
         f"{count} more; of {len(found)} none is unavailable, {unknown} are unknown since the device has no value for "
         "them; the log is empty",
+    )
+
+
+def the_wire_is_seen(house: House) -> None:
+    """What bus and devices say of their wire: names, units, digits, and figures that can be."""
+    house.home.wait(OF_WIRE, LONG_PATIENCE)
+    found = house.home.ask("entities")
+    of_wire = {key: one for key, one in found.items() if "_wire_" in key or key.startswith("busker_bus_")}
+    # Commands may not have waited, and slow polls not have come round: a command for what they read begins their period anew.
+    may_be_unknown = re.compile(r".*_(command_wait_\w+|slow_period)")
+    unknown = {key for key, one in of_wire.items() if not one["known"] and not may_be_unknown.fullmatch(key)}
+    same(unknown, set(), "the figures that are not known")
+    slow = {key: one["state"] for key, one in of_wire.items()
+            if one["unit"] == "ms" and one["known"] and not 0 <= one["number"] < (3000 if "command" in key else 200)}
+    same(slow, {}, "what takes impossibly long")
+    loads = {key: one["state"] for key, one in of_wire.items() if one["unit"] == "%" and not 0 < one["number"] <= 100}
+    same(loads, {}, "the loads that cannot be")
+    asked = {key: one["state"] for key, one in of_wire.items() if key.endswith("_requests") and not one["number"] > 0}
+    same(asked, {}, "who was never asked")
+    house.log_is_empty()
+    figures = ", ".join(f"{found[key]['name']} {found[key]['state']} {found[key]['unit'] or ''}".strip()
+                        for key in OF_WIRE if key.startswith(BUS))
+    print(f"  {figures}", flush=True)
+    house.report.row(
+        "what a bus and a device say of their wire, with all of it enabled",
+        f"{len(of_wire)} diagnostic entities with names, units and digits as wanted; each figure is known but waits of "
+        "commands where there were none and slow polls that did not come round yet, and is one that can be; the log is empty",
     )
 
 
@@ -358,9 +429,9 @@ def devices_obey(house: House) -> None:
 
 def every_control(house: House) -> None:
     """Every switch, number, select and text is set to another value and back."""
-    counts, limited = {}, set()
+    counts, limited, refused = {}, set(), set()
     for platform, other in (("switch", other_flag), ("number", other_number), ("select", other_option), ("text", other_text)):
-        there, back = [], []
+        there, back, not_again = [], [], []
         for one in house.settle().values():
             device = house.by_identity.get(one.identity)
             if one.platform != platform or not device or one.point() in device.deciding():
@@ -370,7 +441,7 @@ def every_control(house: House) -> None:
             now = one.payload()
             there.append(other(one, now, device.points[one.point()]))
             if now is not None and (call := as_it_was(one, now)):
-                back.append(call)
+                (not_again if ONLY_SHOWN.get(one.unique_id) == now else back).append(call)
         counts[platform] = len(there)
         before = raw(house, there)
         at_limits = house.act(there)
@@ -382,14 +453,31 @@ def every_control(house: House) -> None:
         changed = {key for key, words in after.items() if words != before[key]}
         same(changed - at_limits, set(), "the registers that did not come back")
         limited |= at_limits
+        for call in not_again:
+            is_refused(house, call)
+            refused.add(call.one.unique_id)
+    same(refused, set(ONLY_SHOWN), "what may not be written again")
     house.settle()
     house.log_is_empty()
     house.report.row(
         "every control but those of modes is set to another value, and back",
         ", ".join(f"{count} of {platform}" for platform, count in counts.items())
         + f": the register changes, the state follows, the register is as before; of {len(limited)} the device takes only "
-        "part since another register limits them, and the state shows which",
+        f"part since another register limits them, and the state shows which; {len(refused)} shows a factory value that nobody "
+        "may write: it is refused, and the state stays",
     )
+
+
+def is_refused(house: House, call: Call) -> None:
+    """What Home Assistant shows, and busker writes to no device."""
+    device, point = house.device(call.one.identity), call.one.point()
+    held, shown = device.raw(point), house.home.ask("entities")[call.one.unique_id]["state"]
+    topic = call.one.outcome_topic()
+    with house.broker.listening([topic]) as ears:
+        house.home.call(call.service, call.one.unique_id, **call.data)
+        ears.wait_for(lambda _, payload: bool(payload) and json.loads(payload)["outcome"] == "refused", f"that {call} was refused")
+    same(device.raw(point), held, f"the register after {call}")
+    house.home.wait({call.one.unique_id: {"state": shown}})
 
 
 def raw(house: House, calls: list[Call]) -> dict[str, list[int]]:
@@ -798,6 +886,79 @@ def restarts(house: House) -> None:
     )
 
 
+def other_topics(house: House) -> None:
+    """Values stand elsewhere, are not kept by the broker, and come in one message for each device, too."""
+    relays = house.device(DO4)
+    lines = sorted({device.line.name for device in house.devices})
+    place = f"busker/{relays.line.name}/modbus/{relays.name}"
+    before = set(house.settle())
+    usual, house.gateway.wishes = house.gateway.wishes, house.gateway.wishes | {
+        "mqtt": {"topics": "{base}/{bus}/modbus/{device}/{point}", "qos": 0, "retain": False, "json": True}
+    }
+    house.witness = {}
+    with house.broker.witness(["homeassistant/#", *(f"busker/{name}/#" for name in ["bridge", *lines])], house.witness):
+        house.gateway.reload()
+        same(set(house.settle()), before, "the entities")
+        house.log_is_empty()
+        told_always = {f"busker/{device.line.name}/modbus/{device.name}/{what}" for device in house.devices
+                       for what in ("availability", "info", "health")}
+        is_kept(house, [*lines, *(device.name for device in house.devices)], told_always)
+        obeys(house, relays, place)
+        starts = {
+            "Home Assistant": (house.home.stop, house.home.start),
+            "the broker": (lambda: house.broker.stop(forget=True), house.broker.start),
+            "busker": (house.gateway.kill, house.gateway.start),
+        }
+        for names in (["Home Assistant"], ["the broker"], ["busker"], list(starts)):
+            since = time.monotonic()
+            held = states(house)
+            for name in names:
+                starts[name][0]()
+            for name in names:
+                starts[name][1]()
+            house.settle()
+            house.log_is_empty()
+            same(states(house), held, f"the states after the restart of {names}")
+            print(f"  {', '.join(names)}: {time.monotonic() - since:.0f} s", flush=True)
+        obeys(house, relays, place)
+    house.witness = None
+    house.gateway.wishes = usual
+    house.gateway.reload()
+    is_kept(house, lines, set())
+    same(set(house.settle()), before, "the entities")
+    house.log_is_empty()
+    house.report.row(
+        "`mqtt: {topics: \"{base}/{bus}/modbus/{device}/{point}\", qos: 0, retain: false, json: true}`",
+        "the same entities with the same ids and their states; the broker keeps no value; a relay obeys and stands in its "
+        "device's JSON message; so it is after Home Assistant, the broker, which forgets everything, and busker were "
+        "started anew, each alone and all three; reloaded with the usual topics, nothing stays at the others; the log is empty",
+    )
+
+
+def is_kept(house: House, levels: list[str], wanted: set[str]) -> None:
+    """The broker keeps these topics below these levels, and no others, after a while."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        kept = {topic for topic in house.broker.retained(levels) if topic.startswith("busker/")}
+        kept -= {topic for topic in kept if topic.startswith("busker/bridge/")}
+        if kept == wanted or time.monotonic() > deadline:
+            break
+    same(kept, wanted, "what the broker keeps")
+
+
+def obeys(house: House, relays: Device, place: str) -> None:
+    """A relay goes on and off: the coil, the entity, and the device's JSON message."""
+    for service, payload, coil in (("switch.turn_on", "ON", 1), ("switch.turn_off", "OFF", 0)):
+        with house.broker.listening([place, f"{place}/relay_3/outcome"]) as ears:
+            house.home.call(service, DO4 + "_relay_3")
+            house.home.wait({DO4 + "_relay_3": {"state": payload.lower()}})
+            ears.wait_for(lambda topic, text: topic.endswith("/outcome") and json.loads(text)["outcome"] == "done",
+                          "that the relay obeyed")
+            ears.wait_for(lambda topic, text: topic == place and json.loads(text)["relay_3"] == payload,
+                          f"the relay's {payload} in the JSON message")
+        same(relays.read("coil", 2), [coil], "the coil of the relay")
+
+
 def states(house: House) -> dict[str, str]:
     """The states of what holds still."""
     return {
@@ -915,7 +1076,8 @@ def the_end(house: House) -> None:
 
 CHECKS = [
     everything_is_there, everything_is_enabled, devices_are_seen, devices_obey, eeprom_is_spared, every_control, every_button,
-    an_event_arrives, every_mode, every_thing, a_damper_moves, a_valve_moves, restarts, nobody_listens, nobody_is_gone, names, the_end,
+    an_event_arrives, every_mode, every_thing,
+    the_wire_is_seen, a_damper_moves, a_valve_moves, restarts, other_topics, nobody_listens, nobody_is_gone, names, the_end,
     thousands_of_points,
 ]
 

@@ -89,7 +89,7 @@ class Announced:
     def point(self) -> str | None:
         """The name of the point or thing that it commands or shows."""
         topic = self.component.get("command_topic") or self.component.get("state_topic")
-        found = re.fullmatch(r"busker/\w+/(\w+)(/set)?", topic or "")
+        found = re.fullmatch(r"busker/[\w/]+?/(\w+)(/set)?", topic or "")
         return found and found[1]
 
     def identity_facts(self) -> dict:
@@ -108,8 +108,8 @@ class Announced:
         if not self.is_available:
             return {"state": "unavailable"}
         if "value_json" in self.component.get("value_template", ""):
-            # One of the gateway's counters, which do not hold still.
-            return {"known": True}
+            value = self.figure()
+            return {"state": "unknown"} if value is None else {"known": True}
         if self.platform in ("button", "event"):
             # Their state is when something last happened.
             return {}
@@ -126,7 +126,7 @@ class Announced:
         if payload is None:
             return {"state": "unknown"}
         if self.platform in ("switch", "binary_sensor"):
-            return {"state": payload.lower()}
+            return {"state": "on" if payload == self.component.get("payload_on", "ON") else "off"}
         if self.platform in ("cover", "valve"):
             return {"state": "unknown" if payload == "stopped" else payload}
         if self.platform == "number":
@@ -141,6 +141,15 @@ class Announced:
                 return {"state": "unknown"}
             return {"known": True} if self.is_converted() else self.unit_facts() | {"number": value}
         return {"state": self.option(payload)}
+
+    def figure(self):
+        """What the gateway says of itself, a bus or a device: what the template takes out of a JSON message."""
+        found = json.loads(self.payload())
+        path = re.search(r"value_json((?:\.\w+|\['\w+'\])+)", self.component["value_template"])
+        for step in re.findall(r"\w+", path[1]):
+            # What is not in it at all is a mistake in the template.
+            found = found[step]
+        return found
 
     def option(self, name: str) -> str:
         """What a select shows for the value of this name: Home Assistant takes `none` for unknown."""

@@ -183,14 +183,14 @@ class Gateway:
         self.devices = list(devices)
         self.start()
 
-    def start(self) -> None:
+    def configure(self) -> pathlib.Path:
         buses = {device.line.name: device.line.bus for device in self.devices}
         settings = {
-            "mqtt": {"url": f"mqtt://127.0.0.1:{self.broker.port}"},
             "http": {"listen": None},
             "profiles": [str(OWN_PROFILES)],
             "state_dir": f"{self.folder}/state",
             **self.wishes,
+            "mqtt": {"url": f"mqtt://127.0.0.1:{self.broker.port}", **self.wishes.get("mqtt", {})},
             "buses": buses,
             "devices": {
                 device.name: {"profile": device.profile, "bus": device.line.name, "unit": device.unit,
@@ -200,6 +200,15 @@ class Gateway:
         }
         configuration = self.folder / "busker.yaml"
         configuration.write_text(json.dumps(settings))
+        return configuration
+
+    def reload(self) -> None:
+        """Takes the configuration as it is now, and goes on."""
+        self.configure()
+        self.process.send_signal(signal.SIGHUP)
+
+    def start(self) -> None:
+        configuration = self.configure()
         with (self.folder / "gateway.log").open("a") as log:
             self.process = subprocess.Popen(
                 [self.busker.program, "run", "--config", str(configuration)], stdin=subprocess.DEVNULL,
@@ -267,6 +276,19 @@ class Broker:
                 ears.client.publish("test/marker", part, 1)
                 ears.wait_for(lambda _, payload: payload == part, "the end of what the broker holds")
         return found
+
+    @contextlib.contextmanager
+    def witness(self, topics: list[str], heard: dict[str, str]):
+        """Keeps in `heard` what was last said on each topic, be it retained or not."""
+
+        def receive(message) -> None:
+            if message.payload:
+                heard[message.topic] = message.payload.decode()
+            else:
+                heard.pop(message.topic, None)
+
+        with self.listening(topics, receive):
+            yield
 
     @contextlib.contextmanager
     def listening(self, topics: list[str], receive=lambda _: None):

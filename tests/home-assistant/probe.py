@@ -91,6 +91,7 @@ class Probe:
             "device_class": entry.original_device_class,
             "state_class": attributes.get("state_class"),
             "unit": attributes.get("unit_of_measurement"),
+            "precision": entry.options.get("sensor", {}).get("suggested_display_precision"),
             "category": entry.entity_category.value if entry.entity_category else None,
             "enabled": entry.disabled_by is None,
             "options": attributes.get("options"),

@@ -22,6 +22,8 @@ pub struct Gateway {
     pub prefix: String,
     /// The oldest that must understand it.
     pub release: Release,
+    /// Whether the broker keeps values.
+    pub retains: bool,
 }
 
 impl Gateway {
@@ -30,6 +32,7 @@ impl Gateway {
             topics: Topics::of(mqtt),
             prefix: home_assistant.prefix.clone(),
             release: home_assistant.minimum_version,
+            retains: mqtt.values.retain,
         }
     }
 
@@ -199,7 +202,13 @@ pub fn announcement(
         let entities =
             entity(&device.device, index, known).into_iter().chain(companions(&device.device, index, known));
         for entity in entities {
-            components.push((entity.key.clone(), component(&identity, own, device, &point.name, &entity)));
+            let mut component = component(&identity, own, device, &point.name, &entity);
+            if !gateway.retains && entity.device_class.as_deref() == Some("enum") {
+                // What the broker keeps of an earlier run is taken back with an empty message, which Home
+                // Assistant passes over for all others, and warns of here.
+                component.insert("value_template".into(), "{{ value or none }}".into());
+            }
+            components.push((entity.key.clone(), component));
         }
     }
     if device.device.points.iter().any(|point| point.persistent) {
@@ -227,7 +236,7 @@ fn diagnostics(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> C
     let (topic, entity, key, object) = (own.health(), &device.name, "wire_", "value_json");
     let place = Place { identity, entity, key, topic: &topic, object };
     let mut components = place.times(&["turnaround_p95"]);
-    for (class, name) in [(Poll::Fast, "Fast period"), (Poll::Slow, "Slow period")] {
+    for (class, name) in [(Poll::Fast, "Period of fast polls"), (Poll::Slow, "Period of slow polls")] {
         if device.device.points.iter().any(|point| point.poll == class) {
             components.push(place.period(class.name(), name, class == Poll::Fast));
         }
@@ -303,12 +312,17 @@ fn without_empty(mut value: Value) -> Value {
 mod tests {
     use super::*;
     use crate::engine::address::{Address, Span, Table};
-    use crate::engine::device::{Case, Encoding, Form, Kind, Point, Poll, Unit, Write, WriteRule};
+    use crate::engine::device::{Case, Encoding, Form, Kind, Names, Point, Poll, Unit, Write, WriteRule};
     use crate::engine::homeassistant::{announce_bridge, announce_bus};
     use crate::engine::test_device::device_of;
 
     fn gateway() -> Gateway {
-        Gateway { topics: Topics::new("busker"), prefix: "homeassistant".into(), release: Release::USUAL }
+        Gateway {
+            topics: Topics::new("busker"),
+            prefix: "homeassistant".into(),
+            release: Release::USUAL,
+            retains: true,
+        }
     }
 
     /// A relay, and an input that is °C or V as its mode (0, 1, 2: none) says.
@@ -399,6 +413,23 @@ mod tests {
     }
 
     #[test]
+    fn an_empty_message_which_takes_a_value_back_is_none_of_an_enumerations_names() {
+        let mut mode =
+            Point::new("mode", Address { span: Span::single(Table::Input, 0), bits: None }, Poll::Fast);
+        let names = Names::All(vec![(0, "mains".into()), (1, "battery".into())]);
+        mode.encoding = Encoding::Plain(Form { names, ..Form::new(Kind::U16) });
+        let device = DeviceSettings { device: device_of(vec![mode]).into(), ..device() };
+        let template = |retains: bool| {
+            let gateway = Gateway { retains, ..gateway() };
+            let told = payload(&announcement(&gateway, &device, "cellar", &[None]).message());
+            assert_eq!(told["components"]["mode"]["device_class"], "enum");
+            told["components"]["mode"]["value_template"].clone()
+        };
+        assert_eq!(template(false), "{{ value or none }}");
+        assert_eq!(template(true), Value::Null);
+    }
+
+    #[test]
     fn how_a_device_is_on_its_wire_is_told_by_few_entities_and_by_more_that_can_be_enabled() {
         let told = payload(&announced(None).message());
         let components = told["components"].as_object().expect("an object");
@@ -412,16 +443,17 @@ mod tests {
         assert!(wire().all(|(_, component)| component["entity_category"] == "diagnostic"));
         let expected = json!({
             "platform": "sensor",
-            "name": "Turnaround, 95 %",
+            "name": "Turnaround, 95th percentile",
             "entity_category": "diagnostic",
             "device_class": "duration",
-            "unit_of_measurement": "s",
+            "unit_of_measurement": "ms",
             "state_class": "measurement",
-            "suggested_display_precision": 3,
+            "suggested_display_precision": 1,
             "unique_id": "busker_heating_wire_turnaround_p95",
             "default_entity_id": "sensor.heating_wire_turnaround_p95",
             "state_topic": "busker/heating/health",
-            "value_template": "{{ value_json.turnaround_seconds.p95 }}",
+            "value_template": "{{ (value_json.turnaround_seconds.p95 * 1000) | round(2) \
+                               if value_json.turnaround_seconds.p95 is not none else none }}",
         });
         assert_eq!(components["wire_turnaround_p95"], expected);
     }

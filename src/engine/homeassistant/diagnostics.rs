@@ -23,8 +23,11 @@ pub(super) type Components = Vec<(String, Map<String, Value>)>;
 enum Looks {
     /// Counts since the start.
     Counter,
-    /// Seconds, which may be few thousandths.
-    Seconds,
+    /// How long something on the wire takes: told in seconds, of which it is thousandths, and shown in
+    /// milliseconds.
+    Milliseconds,
+    /// How often polls come round.
+    Period,
 }
 
 impl Place<'_> {
@@ -61,12 +64,8 @@ impl Place<'_> {
     ) -> (String, Map<String, Value>) {
         let more = match looks {
             Looks::Counter => json!({"state_class": "total_increasing", "suggested_display_precision": 0}),
-            Looks::Seconds => json!({
-                "device_class": "duration",
-                "unit_of_measurement": "s",
-                "state_class": "measurement",
-                "suggested_display_precision": 3,
-            }),
+            Looks::Milliseconds => duration("ms", 1),
+            Looks::Period => duration("s", 2),
         };
         let (key, mut component) = self.entity("sensor", key, name, value, more);
         if !enabled {
@@ -108,14 +107,17 @@ impl Place<'_> {
             ("command_wait", "Wait of commands"),
         ];
         let mut components = Components::new();
+        let percentiles = [("p50", "median"), ("p95", "95th percentile"), ("p99", "99th percentile")];
         for (key, name) in names {
-            for percentile in ["p50", "p95", "p99"] {
+            for (percentile, spoken) in percentiles {
                 let whole = format!("{key}_{percentile}");
-                let title = format!("{name}, {} %", &percentile[1..]);
-                let value = format!("OBJECT.{key}_seconds.{percentile}");
+                let title = format!("{name}, {spoken}");
+                let told = format!("OBJECT.{key}_seconds.{percentile}");
+                // Null, where there was nothing lately, stays what Home Assistant calls unknown.
+                let value = format!("({told} * 1000) | round(2) if {told} is not none else none");
                 let enabled = often.contains(&whole.as_str());
                 if enabled || key == "turnaround" || percentile == "p95" {
-                    components.push(self.of_wire(&whole, &title, &value, Looks::Seconds, enabled));
+                    components.push(self.of_wire(&whole, &title, &value, Looks::Milliseconds, enabled));
                 }
             }
         }
@@ -125,8 +127,17 @@ impl Place<'_> {
     /// The real period of a poll class.
     pub(super) fn period(&self, class: &str, name: &str, enabled: bool) -> (String, Map<String, Value>) {
         let value = format!("OBJECT.periods.{class}.seconds");
-        self.of_wire(&format!("{class}_period"), name, &value, Looks::Seconds, enabled)
+        self.of_wire(&format!("{class}_period"), name, &value, Looks::Period, enabled)
     }
+}
+
+fn duration(unit: &str, digits: u8) -> Value {
+    json!({
+        "device_class": "duration",
+        "unit_of_measurement": unit,
+        "state_class": "measurement",
+        "suggested_display_precision": digits,
+    })
 }
 
 pub(super) fn object(value: Value) -> Map<String, Value> {

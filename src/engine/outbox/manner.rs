@@ -15,6 +15,11 @@ impl Outbox {
     pub fn manner(&self, message: &Message) -> Manner {
         let is_removal = message.retain && message.payload.is_empty();
         match self.topics.kind(&message.topic) {
+            // A broker keeps messages in order only within one quality: a value must not overtake the removal
+            // of what the broker kept. It is lost if the connection is, at this moment.
+            Kind::Value if is_removal && self.retained.contains_key(&*message.topic) => {
+                Manner { retain: true, ..self.values }
+            }
             Kind::Value if !is_removal => {
                 Manner { retain: message.retain && self.values.retain, ..self.values }
             }
@@ -104,6 +109,17 @@ mod tests {
                 "busker/boiler `` 1 r",
                 "busker/boiler `{}` 1",
                 &format!("{event} 1"),
+            ],
+        );
+        check(
+            false,
+            false,
+            &[
+                "busker/boiler/flow `` 0 r",
+                "busker/boiler/flow `21.5` 0",
+                "busker/boiler `` 0 r",
+                "busker/boiler `{}` 0",
+                &format!("{event} 0"),
             ],
         );
     }
