@@ -32,12 +32,15 @@ fn nothing_is_left_in_home_assistant_of_what_only_the_gateway_remembers() {
     rig::eventually(|| holds(&[RELAYS, BOARD])).expect("what is announced is remembered");
     drop(watcher);
 
+    let mut watcher = None;
     let forgets = || {
         broker.kill();
         broker.restart();
+        // It listens before the gateway speaks.
+        watcher = Some(Watcher::start(&broker, "watcher"));
     };
     let gateway = gateway.start_again(forgets, &text("one: {at: input 0, poll: fast}", ""));
-    let watcher = Watcher::start(&broker, "watcher");
+    let watcher = watcher.expect("it was started meanwhile");
     watcher.publish("homeassistant/status", "online");
     // Home Assistant lets go only of what it has been told since its start, so that comes first.
     let told = |topic: &str| -> Vec<String> {
