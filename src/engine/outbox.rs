@@ -22,6 +22,8 @@ use queue::{Lane, Queue, Queued};
 /// Home Assistant subscribes to the states of a new entity only some time after it was announced,
 /// and takes no notice of what comes before (0.4 s were too short, 0.8 s long enough).
 const STATES_AFTER_DISCOVERY: Duration = Duration::from_millis(1500);
+/// And again so long after that where the broker keeps no values: a busy Home Assistant needs longer to listen.
+const STATES_ONCE_MORE: Duration = Duration::from_secs(13);
 
 /// The messages of one gateway on their way to its broker.
 #[derive(Clone, Debug)]
@@ -45,6 +47,8 @@ pub struct Outbox {
     /// Counts the retained topics, to send them again in the order in which they first came.
     next_number: u64,
     states_due_at: Option<Time>,
+    /// After these states come once more ([`STATES_ONCE_MORE`]).
+    tells_once_more: bool,
 }
 
 #[derive(Clone, Debug)]
@@ -78,6 +82,7 @@ impl Outbox {
             dropped: 0,
             next_number: 0,
             states_due_at: None,
+            tells_once_more: false,
         }
     }
 
@@ -97,6 +102,11 @@ impl Outbox {
             return None;
         }
         let message = self.take_first()?;
+        if !self.values.retain && message.topic.starts_with(&self.discovery_prefix) {
+            // Home Assistant listens for values after it has read this, and the broker keeps none for it.
+            self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
+            self.tells_once_more = true;
+        }
         self.pace.told();
         Some(message)
     }
@@ -202,7 +212,8 @@ impl Outbox {
     /// The time of [`Outbox::wake_at`] has come.
     pub fn wake(&mut self, now: Time) {
         if self.states_due_at.is_some_and(|due| due <= now) {
-            self.states_due_at = None;
+            let once_more = std::mem::take(&mut self.tells_once_more);
+            self.states_due_at = once_more.then(|| now + STATES_ONCE_MORE);
             self.queue_again(|rank| rank != Rank::Discovery);
         }
     }

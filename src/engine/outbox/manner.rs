@@ -141,6 +141,19 @@ mod tests {
     }
 
     #[test]
+    fn what_is_not_retained_is_told_again_when_home_assistant_has_read_an_announcement() {
+        let mut outbox = outbox(true, false);
+        outbox.push(Message::retained("busker/boiler/flow", "21.5"));
+        outbox.push(Message::retained("homeassistant/device/busker_boiler/config", "x"));
+        assert_eq!(sent(&mut outbox).len(), 3);
+        for _ in 0..2 {
+            outbox.wake(outbox.wake_at().expect("values follow"));
+            assert_eq!(sent(&mut outbox), ["busker/boiler/flow `21.5` 1"]);
+        }
+        assert_eq!(outbox.wake_at(), None);
+    }
+
+    #[test]
     fn a_removal_that_could_not_be_handed_over_comes_again() {
         let mut outbox = outbox(true, false);
         outbox.push(Message::retained("busker/boiler/flow", "21.5"));

@@ -40,7 +40,10 @@ impl Outbox {
 
     /// The gateway will be another one: nothing that it told stays at the broker, but that it is offline.
     pub fn take_back_everything(&mut self) {
-        for topic in self.in_order(|rank| rank != Rank::BridgeState) {
+        // First what Home Assistant was announced, so that nobody reads anything out of the empty messages.
+        let announced = self.in_order(|rank| rank == Rank::Discovery);
+        let others = self.in_order(|rank| rank != Rank::Discovery && rank != Rank::BridgeState);
+        for topic in announced.into_iter().chain(others) {
             self.take_back(&topic);
         }
     }
