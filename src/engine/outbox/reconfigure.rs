@@ -158,6 +158,9 @@ mod tests {
         let sent = sent(&mut outbox);
         assert_eq!(sent.len(), 8, "{sent:?}");
         assert!(sent.iter().all(|sent| sent.ends_with(' ')), "{sent:?}");
+        let is_announcement = |sent: &&String| sent.starts_with("homeassistant/");
+        let announced = sent.iter().take_while(is_announcement).count();
+        assert!(announced > 0 && announced == sent.iter().filter(is_announcement).count(), "{sent:?}");
     }
 
     #[test]
