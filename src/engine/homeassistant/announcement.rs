@@ -9,7 +9,7 @@ use super::diagnostics::Place;
 use super::entity::{Entity, companions, entity, sentence};
 use super::release;
 use super::thing::thing_component;
-use crate::engine::device::{Platform, Poll};
+use crate::engine::device::{Platform, Poll, ThingKind};
 use crate::engine::settings::{self, DeviceSettings};
 use crate::engine::topics::{self, DeviceTopics, Message, Topics};
 use crate::engine::units::Release;
@@ -204,9 +204,7 @@ pub fn announcement(
         for entity in entities {
             let mut component = component(&identity, own, device, &point.name, &entity);
             if !gateway.retains && entity.device_class.as_deref() == Some("enum") {
-                // What the broker keeps of an earlier run is taken back with an empty message, which Home
-                // Assistant passes over for all others, and warns of here.
-                component.insert("value_template".into(), "{{ value or none }}".into());
+                component.insert("value_template".into(), NOTHING_IS_NONE.into());
             }
             components.push((entity.key.clone(), component));
         }
@@ -215,7 +213,10 @@ pub fn announcement(
         components.push((EEPROM_WRITES.into(), eeprom_writes(&identity, own, device)));
     }
     for thing in &device.device.things {
-        if let Some(component) = thing_component(&identity, own, device, thing, known) {
+        if let Some(mut component) = thing_component(&identity, own, device, thing, known) {
+            if !gateway.retains && thing.kind == ThingKind::Climate {
+                component.insert("mode_state_template".into(), NOTHING_IS_NONE.into());
+            }
             components.push((thing.name.clone(), component));
         }
     }
@@ -244,6 +245,11 @@ fn diagnostics(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> C
     components.extend(place.counters(&["timeouts"]));
     components
 }
+
+/// What the broker keeps of an earlier run is taken back with an empty message, if nothing is to be kept. Home
+/// Assistant passes over it for most, and warns of it where there are names: of enumerations, of a climate's
+/// modes.
+const NOTHING_IS_NONE: &str = "{{ value or none }}";
 
 /// The key of the entity that counts the writes to the device's EEPROM, and the info's too.
 const EEPROM_WRITES: &str = "eeprom_writes";
