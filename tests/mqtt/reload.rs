@@ -135,7 +135,9 @@ fn what_is_unchanged_goes_on_while_the_rest_comes_goes_and_changes() {
         got.topic == "busker/bridge/info" && json(&got.payload)["devices"]["valve"]["bus"] == "other"
     });
     let told = watcher.received();
+    // How it is on its wire is told when anything begins anew.
     let of_pump = topics_of(&told, "pump");
+    let of_pump: Vec<&str> = of_pump.into_iter().filter(|topic| !topic.ends_with("/health")).collect();
     assert!(of_pump.is_empty(), "the pump is told of although it is unchanged: {of_pump:?}");
     let all = remembered(&broker, "newcomer");
     assert!(topics_of(&all, "counters").is_empty(), "{:?}", topics_of(&all, "counters"));
