@@ -15,9 +15,9 @@ impl Outbox {
             self.take_leave(found);
         } else if self.own_devices.contains(topic) {
             self.remembered.insert(topic.to_string(), found);
-        } else {
+        } else if self.departed.insert(topic.to_string(), found).is_none() {
+            // Not twice, if both the broker and we remember it: Home Assistant warns of the second time.
             self.queue_last(Queued::Removal(topic.to_string()));
-            self.departed.insert(topic.to_string(), found);
         }
     }
 

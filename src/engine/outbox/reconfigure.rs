@@ -193,6 +193,9 @@ mod tests {
             "busker/bridge/state online".to_string(),
         ];
         assert_eq!(sent(&mut outbox), expected);
+        // The broker had not forgotten it after all.
+        outbox.found(&pump, &announcement(&["speed"]));
+        assert_eq!(sent(&mut outbox), [""; 0], "once is enough");
         let told = outbox.announced().expect("all of it is told");
         assert_eq!(told, BTreeMap::from([(boiler.as_str(), present.as_str())]));
     }
