@@ -43,6 +43,19 @@ fn a_unit_that_once_came_late_before_it_died_pays_for_the_silence_that_it_is_giv
     assert!(cost > 0.01 && cost <= 0.045, "{:.2} %", cost * 100.0);
 }
 
+#[test]
+fn a_unit_that_returns_soon_after_its_death_is_noticed_as_soon() {
+    let mut world = world(UNITS);
+    world.run_until(world.now + Duration::from_secs(5));
+    power(&mut world, false);
+    // Three requests in vain, and a little more.
+    world.run_until(world.now + Duration::from_secs(6));
+    power(&mut world, true);
+    let returned_at = world.now;
+    world.run_until(returned_at + Duration::from_secs(2));
+    assert!(world.requests().iter().any(|(at, unit)| *unit == DEAD && *at >= returned_at));
+}
+
 /// The unit has been alive for so long, and its return is to be noticed within so long.
 #[track_caller]
 fn check(alive: Duration, noticed_within: Duration) {

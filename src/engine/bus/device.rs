@@ -423,8 +423,13 @@ impl DeviceState {
         }
     }
 
-    /// The line was left alone for so long because this device did not answer. While it is away that counts
-    /// in its share of the bus.
+    /// Whether the request that ends now only asked whether it is there again.
+    pub(super) fn is_probed(&self) -> bool {
+        self.patience.is_probing()
+    }
+
+    /// The line was left alone for so long because this device did not answer a probe: that counts in its
+    /// share of the bus.
     pub(super) fn charge(&mut self, now: Time, waited: Duration) {
         if self.patience.is_probing() {
             self.paused_until = self.paused_until.max(now + Patience::pause_after(waited));

@@ -81,7 +81,7 @@ impl Bus {
             self.devices[silent].charge(now, waited);
         }
         let timed_out = reply.result == Err(RequestError::Timeout);
-        self.times.to_blame = asked.device.filter(|_| timed_out);
+        self.times.to_blame = asked.device.filter(|device| timed_out && self.devices[*device].is_probed());
         if let Some(device) = asked.device {
             self.devices[device].keep_time(now, waited, turnaround, command_waited);
             turnaround
