@@ -82,7 +82,7 @@ impl Counters {
         self.requests += 1;
         match result {
             Ok(_) => self.answers += 1,
-            Err(RequestError::Exception(code)) => {
+            Err(RequestError::Exception(code) | RequestError::Unreachable(code)) => {
                 self.exceptions += 1;
                 let known = usize::from(*code);
                 self.exceptions_by_code[if known < EXCEPTION_CODES { known } else { 0 }] += 1;

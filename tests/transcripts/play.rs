@@ -296,6 +296,9 @@ impl Player {
             ("checksum", _) => Err(RequestError::Checksum),
             ("collision", _) => Err(RequestError::Collision),
             ("wrong-frame", _) => Err(RequestError::WrongFrame),
+            ("exception", code @ ("10" | "11")) => {
+                Err(RequestError::Unreachable(code.parse().expect("a code")))
+            }
             ("exception", code) => Err(RequestError::Exception(code.parse().expect("a code"))),
             ("written", _) => Ok(Answer::Written),
             (kind @ ("names" | "regular"), names) => {

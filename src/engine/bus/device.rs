@@ -467,7 +467,9 @@ impl DeviceState {
             Err(error) => {
                 self.failed(now, &error, context);
                 match (&self.presence, error) {
-                    (Presence::Present, RequestError::Timeout) => self.polls.try_again(index, now),
+                    (Presence::Present, RequestError::Timeout | RequestError::Unreachable(_)) => {
+                        self.polls.try_again(index, now)
+                    }
                     // It is there, and only its answer was spoilt.
                     _ => self.polls.want_again(index),
                 }

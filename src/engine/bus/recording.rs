@@ -59,7 +59,7 @@ impl Bus {
         let is_missed = device.is_some_and(|device| device.is_present());
         let trouble = match &reply.result {
             // Who is known to be away is not missed.
-            Err(RequestError::Timeout) if is_missed => "no answer",
+            Err(RequestError::Timeout | RequestError::Unreachable(_)) if is_missed => "no answer",
             Err(RequestError::Checksum) => "a damaged answer",
             Err(RequestError::WrongFrame) => "an answer that does not fit",
             Err(RequestError::Collision) => "a collision",

@@ -136,6 +136,8 @@ pub struct Identification {
 pub enum RequestError {
     /// The device refused, with this exception code.
     Exception(u8),
+    /// A gateway on the way says with exception 10 or 11 that the device does not answer it.
+    Unreachable(u8),
     /// Nothing that fits came in time.
     Timeout,
     /// Bytes came, but with a wrong checksum.
@@ -155,6 +157,9 @@ impl fmt::Display for RequestError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             RequestError::Exception(code) => write!(f, "exception {code} ({})", exception_name(*code)),
+            RequestError::Unreachable(code) => {
+                write!(f, "no answer behind the gateway: exception {code} ({})", exception_name(*code))
+            }
             RequestError::Timeout => write!(f, "no answer in time"),
             RequestError::Checksum => write!(f, "checksum error"),
             RequestError::WrongFrame => write!(f, "an answer that does not fit the request"),

@@ -51,14 +51,15 @@ pub fn encode(call: &Call) -> Result<Vec<u8>, &'static str> {
 /// address, value, quantity or sub-function that must come back. With `any_exception` an exception
 /// of another function is taken for the answer too.
 ///
-/// `Err` is [`RequestError::Exception`] or [`RequestError::WrongFrame`].
+/// `Err` is [`RequestError::Exception`], [`RequestError::Unreachable`] or [`RequestError::WrongFrame`].
 pub fn decode(call: &Call, any_exception: bool, pdu: &[u8]) -> Result<Answer, RequestError> {
     let (&function, data) = pdu.split_first().ok_or(RequestError::WrongFrame)?;
     if function & EXCEPTION != 0 {
         return Err(match data {
-            [code] if any_exception || function == call.function() | EXCEPTION => {
-                RequestError::Exception(*code)
-            }
+            [code] if any_exception || function == call.function() | EXCEPTION => match code {
+                10 | 11 => RequestError::Unreachable(*code),
+                code => RequestError::Exception(*code),
+            },
             _ => RequestError::WrongFrame,
         });
     }

@@ -216,6 +216,7 @@ mod tests {
         for (what, bytes, result, foreign) in [
             ("the answer", frame(1, 1, &GOOD), answer.clone(), 0),
             ("an exception", frame(1, 1, &[0x84, 2]), Err(RequestError::Exception(2)), 0),
+            ("a gateway's exception", frame(1, 1, &[0x84, 11]), Err(RequestError::Unreachable(11)), 0),
             ("another's first", [frame(77, 1, &GOOD), frame(1, 1, &GOOD)].concat(), answer, 1),
             ("only another's", frame(77, 1, &GOOD), Err(RequestError::Timeout), 1),
             ("another unit", frame(1, 2, &GOOD), wrong.clone(), 1),

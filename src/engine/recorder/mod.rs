@@ -69,7 +69,7 @@ impl End {
     pub fn of<T>(result: &Result<T, RequestError>) -> Option<End> {
         Some(match result {
             Ok(_) => End::Answered,
-            Err(RequestError::Exception(code)) => End::Exception(*code),
+            Err(RequestError::Exception(code) | RequestError::Unreachable(code)) => End::Exception(*code),
             Err(RequestError::Timeout) => End::Timeout,
             Err(RequestError::Checksum) => End::Checksum,
             Err(RequestError::WrongFrame) => End::WrongFrame,

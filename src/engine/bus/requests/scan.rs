@@ -54,9 +54,7 @@ impl Scanning {
 
     fn take(&mut self, call: &Call, result: &Result<Answer, RequestError>) {
         let is_silence = match result {
-            Ok(_) => false,
-            // With 10 and 11 a gateway says that nobody is there.
-            Err(RequestError::Exception(code)) => matches!(code, 10 | 11),
+            Ok(_) | Err(RequestError::Exception(_)) => false,
             Err(_) => true,
         };
         if is_silence {
