@@ -138,7 +138,7 @@ record! {
     /// The flight recorder: what was last on the wire of each bus.
     pub struct Recorder {
         /// So many kilobytes are kept in memory for each bus; 0: nothing.
-        kilobytes: At<u16> = At::nowhere(32),
+        kilobytes: At<u32> = At::nowhere(32),
         /// Whether they are saved when something goes wrong on the bus, and not only on request.
         on_error: bool = true,
         /// Then not more often than once in this time, and less often while it goes on going wrong.

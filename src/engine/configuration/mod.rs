@@ -104,7 +104,7 @@ pub fn schema() -> Json {
 }
 
 /// A longer tape than this is a capture, which is another program's job.
-const RECORDER_KILOBYTES_MAX: u16 = 4096;
+const RECORDER_KILOBYTES_MAX: u32 = 4096;
 
 struct Resolver<'a> {
     library: &'a Library,
@@ -173,7 +173,7 @@ impl Resolver<'_> {
             self.faults.add(&file.keep.place, message);
         }
         Recorder {
-            bytes: usize::from(kilobytes) * 1024,
+            bytes: kilobytes as usize * 1024,
             on_error: (file.on_error && kilobytes > 0).then_some(file.interval.value),
             keep: file.keep.value.into(),
         }
