@@ -168,8 +168,7 @@ impl Bus {
             };
             Some((index, device.next_setting(self.now, is_settling)?))
         };
-        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-        let Some((device, (point, wanted))) = devices.find_map(next) else { return false };
+        let Some((device, (point, wanted))) = self.askable().find_map(next) else { return false };
         let orders = VecDeque::from([(point, wanted.clone())]);
         self.begin_order(device, Target::Setting(point), wanted, None, orders);
         true

@@ -220,30 +220,32 @@ impl DeviceState {
     }
 
     pub(super) fn most_urgent(&self, now: Time) -> Option<(Polled, Urgency)> {
-        if now < self.paused_until {
-            return None;
-        }
-        if self.presence != Presence::Present {
-            if let Some(call) = self.identification_call() {
-                return Some((Polled::Identification(call), Urgency::Wanted));
-            }
-        }
-        let (index, urgency) = self.polls.most_urgent(now)?;
-        Some((self.read_call(index), urgency))
+        self.next_question(now, Urgency::Wanted, |polls| polls.most_urgent(now))
     }
 
     /// What has waited longest, wanted at once or not, and for how many of its periods.
     pub(super) fn longest_waiting(&self, now: Time) -> Option<(Polled, f64)> {
+        self.next_question(now, f64::INFINITY, |polls| polls.longest_waiting(now))
+    }
+
+    /// Its identification, if that is not known, which is as urgent as `of_identification`; or the read that
+    /// `of_polls` finds.
+    fn next_question<U>(
+        &self,
+        now: Time,
+        of_identification: U,
+        of_polls: impl FnOnce(&Polls) -> Option<(usize, U)>,
+    ) -> Option<(Polled, U)> {
         if now < self.paused_until {
             return None;
         }
         if self.presence != Presence::Present {
             if let Some(call) = self.identification_call() {
-                return Some((Polled::Identification(call), f64::INFINITY));
+                return Some((Polled::Identification(call), of_identification));
             }
         }
-        let (index, waited) = self.polls.longest_waiting(now)?;
-        Some((self.read_call(index), waited))
+        let (index, urgency) = of_polls(&self.polls)?;
+        Some((self.read_call(index), urgency))
     }
 
     pub(super) fn read_call(&self, index: usize) -> Polled {

@@ -342,13 +342,11 @@ impl Bus {
             let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
             return records.chain(expiring).chain([self.silent_until]).min();
         }
-        let of_devices =
-            self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::due_at);
+        let of_devices = self.askable().filter_map(|(_, device)| device.due_at());
         let spared =
             self.waiting.iter().map(|waiting| self.devices[waiting.device].writable_at(waiting.target));
         let settings = self.devices.iter().filter_map(DeviceState::next_setting_at);
-        let beats =
-            self.devices.iter().filter(|device| self.may_ask(device)).filter_map(DeviceState::beats_at);
+        let beats = self.askable().filter_map(|(_, device)| device.beats_at());
         of_devices
             .chain(self.waiting.next_deadline())
             .chain(spared.chain(settings).filter(|at| *at > self.now))

@@ -40,8 +40,7 @@ impl Bus {
                 continue;
             }
             let now = self.now;
-            let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-            let urgent = candidates.filter_map(|(index, device)| {
+            let urgent = self.askable().filter_map(|(index, device)| {
                 device.most_urgent(now).map(|(polled, urgency)| (index, polled, urgency, device.served_at()))
             });
             // Of two equally urgent ones, that which has waited longest.
@@ -89,8 +88,7 @@ impl Bus {
         }
         self.ahead = 0;
         let now = self.now;
-        let candidates = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-        let overdue = candidates.filter_map(|(index, device)| {
+        let overdue = self.askable().filter_map(|(index, device)| {
             let (polled, waited) = device.longest_waiting(now)?;
             Some((index, polled, waited))
         });
@@ -110,8 +108,7 @@ impl Bus {
             return false;
         }
         let now = self.now;
-        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-        let due = devices.find_map(|(index, device)| Some((index, device.beat_due(now, late)?)));
+        let due = self.askable().find_map(|(index, device)| Some((index, device.beat_due(now, late)?)));
         let Some((device, point)) = due else { return false };
         let call = Call::Read(self.devices[device].details(point).at.span);
         self.send(device, call, Purpose::BeatRead(point));
@@ -124,8 +121,7 @@ impl Bus {
             return false;
         }
         let now = self.now;
-        let mut devices = self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device));
-        let due = devices.find_map(|(index, device)| Some((index, device.feed_due(now, late)?)));
+        let due = self.askable().find_map(|(index, device)| Some((index, device.feed_due(now, late)?)));
         let Some((device, read)) = due else { return false };
         self.poll(device, self.devices[device].read_call(read));
         if let Some(in_flight) = &mut self.in_flight {
@@ -133,6 +129,11 @@ impl Bus {
             in_flight.gives_way &= !late;
         }
         true
+    }
+
+    /// The devices that may be asked something by the bus itself, and their numbers.
+    pub(super) fn askable(&self) -> impl Iterator<Item = (usize, &DeviceState)> {
+        self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device))
     }
 
     /// Not a device that leaves. And one whose watchdog must run out is not spoken to while the broker is away.
