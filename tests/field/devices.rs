@@ -112,8 +112,8 @@ fn dead_unit() {
     stage.shows_all();
     let from = peer.asked().len();
     is_dead.store(true, Ordering::SeqCst);
-    stage.observer.wait_for("busker/three/availability", "offline");
-    stage.observer.wait_for("busker/three/a", "None");
+    stage.watcher.shows("busker/three/availability", "offline");
+    stage.watcher.shows("busker/three/a", "None");
     let of_dead = || peer.asked()[from..].iter().filter(|asked| asked.unit == 3).count();
     wait_for("a hundred reads of the others", || {
         (peer.asked().len() - from >= 100 + of_dead()).then_some(())
@@ -122,7 +122,7 @@ fn dead_unit() {
     let three = stage.device("three");
     assert!(three["reason"].as_str().is_some_and(|reason| reason.contains("no answer in time")), "{three}");
     is_dead.store(false, Ordering::SeqCst);
-    stage.observer.wait_for("busker/three/availability", "online");
+    stage.watcher.shows("busker/three/availability", "online");
     stage.ends_well();
 }
 

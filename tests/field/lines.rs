@@ -152,7 +152,7 @@ fn echo() {
     damages.store(false, Ordering::SeqCst);
     // A collision is no silence, and no fault of the unit's.
     assert_eq!((stage.counter("timeouts"), stage.counter("checksum_errors")), (0, 0));
-    assert_eq!(stage.observer.payloads("busker/one/availability").last().map(String::as_str), Some("online"));
+    assert_eq!(stage.watcher.payloads("busker/one/availability").last().map(String::as_str), Some("online"));
     peer.be_deaf_to_writes();
     let outcome = stage.command("one/relay", "OFF");
     assert_ne!(outcome["outcome"], "done", "{outcome}");
@@ -184,13 +184,13 @@ fn unplugged() {
     let terminal = || fs::read_link(peer.path()).expect("a link to the terminal");
     let before = terminal();
     let holds = |path: &Path| {
-        let files = stage.busker.open_files();
+        let files = stage.gateway.open_files();
         files.iter().any(|file| file.to_string_lossy().starts_with(&*path.to_string_lossy()))
     };
     assert!(holds(&before), "the port is open");
     peer.unplug();
-    stage.observer.wait_for("busker/one/availability", "offline");
-    stage.observer.wait_for("busker/one/a", "None");
+    stage.watcher.shows("busker/one/availability", "offline");
+    stage.watcher.shows("busker/one/a", "None");
     wait_for("the dead port to be closed", || (!holds(&before)).then_some(()));
     let reason = wait_for("the bus to be down", || stage.bus()?["reason"].as_str().map(str::to_owned));
     assert!(reason == "unplugged" || reason.contains("is the adapter plugged in?"), "{reason}");
@@ -198,7 +198,7 @@ fn unplugged() {
     let others = Placeholder::take(&before);
     peer.plug_in();
     assert_ne!(terminal(), before, "another name");
-    stage.observer.wait_for("busker/one/availability", "online");
+    stage.watcher.shows("busker/one/availability", "online");
     stage.shows_all();
     assert_eq!(stage.command("one/relay", "ON")["outcome"], "done");
     stage.ends_well();
@@ -231,9 +231,9 @@ fn confused_units() {
 ";
     let stage = Stage::start(&peer, "", devices, &[("two/a", (2, 4, 0)), ("two/relay", (2, 1, 0))]);
     stage.shows_all();
-    stage.observer.wait_for("busker/one/availability", "online");
+    stage.watcher.shows("busker/one/availability", "online");
     is_dead.store(1, Ordering::SeqCst);
-    stage.observer.wait_for("busker/one/availability", "offline");
+    stage.watcher.shows("busker/one/availability", "offline");
     wait_for("two probes", || (is_dead.load(Ordering::SeqCst) > 5).then_some(()));
     assert_eq!(stage.command("two/relay", "ON")["outcome"], "done");
     // One may be lost where the machine keeps this thread waiting.

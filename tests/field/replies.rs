@@ -219,7 +219,7 @@ fn one_refused() {
     let again = after[asked..].iter().filter(|asked| refuses(asked)).count();
     // It may be tried alone once more, and then after a minute.
     assert!(refused <= 4 && again <= 1, "refused {refused} times, and {again} times later");
-    assert!(stage.observer.payloads("busker/one/c").iter().all(|payload| payload == "None"));
+    assert!(stage.watcher.payloads("busker/one/c").iter().all(|payload| payload == "None"));
 
     // A timeout divides nothing: what is asked afterwards was asked before.
     let frames = |from: usize| {
@@ -253,9 +253,7 @@ fn slow_units() {
     stage.counts("late_replies", 1);
     let patient = stage.device("patient");
     assert_eq!(patient["counters"]["timeouts"], 0, "{patient}");
-    wait_for("the word on what to set", || {
-        stage.busker.log().contains("device unknown answers after").then_some(())
-    });
+    stage.gateway.wait_for_log("device unknown answers after");
     stage.ends_well();
 }
 
@@ -277,8 +275,8 @@ fn busy() {
     let stage = Stage::start(&peer, "", &devices, &[("one/a", (1, 4, 0))]);
     stage.shows_all();
     stage.ends_well();
-    stage.observer.wait_for("busker/failing/a", "None");
-    let told = stage.observer.payloads("busker/failing/a");
+    stage.watcher.shows("busker/failing/a", "None");
+    let told = stage.watcher.payloads("busker/failing/a");
     assert!(told.iter().all(|told| told == "None"), "{told:?}");
     let failing = stage.device("failing");
     assert!(failing["points"][0]["reason"] == "exception 4", "{failing}");
@@ -315,7 +313,7 @@ fn three_faults() {
             let is_fair = other == counter || other == "timeouts" || said["counters"][other] == 0;
             assert!(is_fair, "{device} has {other}: {said}");
         }
-        let told = stage.observer.payloads(&format!("busker/{device}/a"));
+        let told = stage.watcher.payloads(&format!("busker/{device}/a"));
         assert!(told.iter().all(|told| told == "None"), "{told:?}");
     }
     stage.ends_well();

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use crate::peer::{Peer, Place};
-use crate::support::{Busker, Mosquitto, Observer, find, wait_for};
+use crate::support::{Broker, Gateway, Watcher, find, wait_for};
 
 /// What no device ever holds.
 pub const LIE: u16 = 9999;
@@ -18,9 +18,9 @@ pub type Shown = (&'static str, Place);
 /// The program on a peer's line.
 pub struct Stage<'p> {
     // In the order in which they end.
-    pub busker: Busker,
-    pub observer: Observer,
-    _broker: Mosquitto,
+    pub gateway: Gateway,
+    pub watcher: Watcher,
+    _broker: Broker,
     peer: &'p Peer,
     shown: Vec<Shown>,
     /// How many commands each point was given.
@@ -41,8 +41,8 @@ impl<'p> Stage<'p> {
     /// `link` is all that the configuration says of the bus. `shown` are the points that are watched;
     /// those of input registers are told a new value at the end.
     pub fn start_on(peer: &'p Peer, link: &str, devices: &str, shown: &[Shown]) -> Stage<'p> {
-        let broker = Mosquitto::start();
-        let observer = Observer::of(&broker);
+        let broker = Broker::start();
+        let watcher = Watcher::start(&broker, "watcher");
         for (number, (_, (unit, function, address))) in (1..).zip(shown) {
             // Each register holds something else, so that none is taken for another.
             if peer.history((*unit, *function, *address)).is_empty() {
@@ -51,8 +51,8 @@ impl<'p> Stage<'p> {
         }
         let configuration =
             format!("home_assistant: {{discovery: false}}\nbuses: {{line: {{{link}}}}}\ndevices:\n{devices}");
-        let busker = Busker::run(&broker, &configuration);
-        Stage { busker, observer, _broker: broker, peer, shown: shown.to_vec(), commands: RefCell::default() }
+        let gateway = Gateway::start(&broker, &configuration);
+        Stage { gateway, watcher, _broker: broker, peer, shown: shown.to_vec(), commands: RefCell::default() }
     }
 
     /// Waits until every point that is watched shows what its register holds.
@@ -66,7 +66,7 @@ impl<'p> Stage<'p> {
     /// Waits until a point shows what its register holds.
     #[track_caller]
     pub fn shows(&self, topic: &str, place: Place) {
-        self.observer.wait_for(&format!("busker/{topic}"), &payload(place, self.peer.holds(place)));
+        self.watcher.shows(&format!("busker/{topic}"), &payload(place, self.peer.holds(place)));
     }
 
     /// Every register of a reading changes, and that is seen.
@@ -83,21 +83,21 @@ impl<'p> Stage<'p> {
     /// Gives a command and waits for its outcome.
     #[track_caller]
     pub fn command(&self, point: &str, wanted: &str) -> Value {
-        let from = self.observer.count();
+        let from = self.watcher.count();
         self.publish(point, wanted);
-        let outcome = self.observer.wait_for_next(&format!("busker/{point}/outcome"), from);
+        let outcome = self.watcher.wait_for_next(&format!("busker/{point}/outcome"), from);
         serde_json::from_str(&outcome).expect("an outcome is JSON")
     }
 
     /// Gives a command.
     pub fn publish(&self, point: &str, wanted: &str) {
         *self.commands.borrow_mut().entry(point.into()).or_default() += 1;
-        self.observer.publish(&format!("busker/{point}/set"), wanted);
+        self.watcher.publish(&format!("busker/{point}/set"), wanted);
     }
 
     /// The kinds of all outcomes of a point so far.
     pub fn outcomes(&self, point: &str) -> Vec<String> {
-        let payloads = self.observer.payloads(&format!("busker/{point}/outcome"));
+        let payloads = self.watcher.payloads(&format!("busker/{point}/outcome"));
         let kind =
             |payload: &String| serde_json::from_str::<Value>(payload).expect("JSON")["outcome"].clone();
         payloads.iter().map(|payload| kind(payload).as_str().expect("a kind").to_owned()).collect()
@@ -117,12 +117,12 @@ impl<'p> Stage<'p> {
     }
 
     pub fn bus(&self) -> Option<Value> {
-        self.busker.json("/api/buses")?.get(0).cloned()
+        self.gateway.json("/api/buses")?.get(0).cloned()
     }
 
     /// What `/api/devices` says of one.
     pub fn device(&self, name: &str) -> Value {
-        let devices = wait_for("the API", || self.busker.json("/api/devices"));
+        let devices = wait_for("the API", || self.gateway.json("/api/devices"));
         let device = devices.as_array().expect("a list").iter().find(|device| device["name"] == name);
         device.unwrap_or_else(|| panic!("no device `{name}`")).clone()
     }
@@ -140,7 +140,7 @@ impl<'p> Stage<'p> {
     pub fn nothing_was_false(&self) {
         for (topic, place) in &self.shown {
             let history = self.peer.history(*place);
-            let mut told = self.observer.payloads(&format!("busker/{topic}"));
+            let mut told = self.watcher.payloads(&format!("busker/{topic}"));
             told.retain(|told| told != "None");
             told.dedup();
             let mut later = history.iter();

@@ -66,10 +66,10 @@ fn orders() {
 ";
     let stage = Stage::start(&peer, "", devices, &[]);
     for order in ["abcd", "cdab", "badc", "dcba"] {
-        stage.observer.wait_for(&format!("busker/floats/{order}"), "123.456");
+        stage.watcher.shows(&format!("busker/floats/{order}"), "123.456");
     }
     let told = || -> Vec<u32> {
-        let both = ["a", "b"].map(|point| stage.observer.payloads(&format!("busker/halves/{point}")));
+        let both = ["a", "b"].map(|point| stage.watcher.payloads(&format!("busker/halves/{point}")));
         both.iter().flatten().filter_map(|payload| payload.parse().ok()).collect()
     };
     wait_for("forty values", || (told().len() >= 40).then_some(()));

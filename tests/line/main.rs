@@ -12,7 +12,7 @@ mod support;
 
 use peer::{Asked, Framing, Misbehave, Peer, Step, read_pdu, reply, rtu};
 use serde_json::Value;
-use support::{Busker, Mosquitto, Observer, wait_for};
+use support::{Broker, Gateway, Watcher, wait_for};
 
 /// What no device ever holds.
 const LIE: u16 = 9999;
@@ -198,42 +198,42 @@ fn on_modbus_tcp_every_fault_is_counted_and_none_is_believed() {
 /// Each fault happens once to a read of `busker/one/a`, which rises by one at the same time. The
 /// other points of the same shape stay as they are: nothing of `a` may be told as theirs.
 fn check_faults<'f>(peer: &Peer, devices: &str, faults: impl IntoIterator<Item = &'f Fault>) {
-    let gateway = Gateway::start(peer, devices);
+    let stage = Stage::start(peer, devices);
     let mut truth = 100;
-    gateway.observer.wait_for("busker/one/a", "100");
-    gateway.observer.wait_for("busker/one/b", "500");
+    stage.watcher.shows("busker/one/a", "100");
+    stage.watcher.shows("busker/one/b", "500");
     if devices == MIXED {
-        gateway.observer.wait_for("busker/two/a", "700");
+        stage.watcher.shows("busker/two/a", "700");
     }
-    let mut expected = gateway.counters();
+    let mut expected = stage.counters();
     for fault in faults {
         truth += 1;
         peer.misbehave_once(1, 4, 0, fault.how);
         peer.hold(1, 4, 0, truth);
         wait_for(fault.name, || peer.has_misbehaved().then_some(()));
-        gateway.observer.wait_for("busker/one/a", &truth.to_string());
+        stage.watcher.shows("busker/one/a", &truth.to_string());
         for (name, count) in fault.counts {
             let index = FAULTS.iter().position(|fault| fault == name).expect("a counter");
             expected[index] += count;
         }
         let mut found = Vec::new();
         let reached = support::find(|| {
-            found = gateway.counters();
+            found = stage.counters();
             (found == expected).then_some(())
         });
         assert!(reached.is_some(), "{}:\n{}", fault.name, told(&found, &expected));
     }
     // Not one more, also after the last.
-    let from = gateway.observer.count();
+    let from = stage.watcher.count();
     peer.hold(1, 4, 100, 501);
-    gateway.observer.wait_for_next("busker/one/b", from);
-    assert_eq!(gateway.counters(), expected);
+    stage.watcher.wait_for_next("busker/one/b", from);
+    assert_eq!(stage.counters(), expected);
 
-    let told_of_a = gateway.values("busker/one/a");
+    let told_of_a = stage.values("busker/one/a");
     let rising: Vec<u64> = (100..=u64::from(truth)).collect();
     assert_eq!(told_of_a, rising, "every value once and in order, nothing else");
-    assert_eq!(gateway.values("busker/one/b"), [500, 501]);
-    assert_eq!(gateway.values("busker/two/a"), if devices == MIXED { &[700][..] } else { &[] });
+    assert_eq!(stage.values("busker/one/b"), [500, 501]);
+    assert_eq!(stage.values("busker/two/a"), if devices == MIXED { &[700][..] } else { &[] });
 }
 
 fn told(found: &[u64], expected: &[u64]) -> String {
@@ -245,18 +245,18 @@ fn told(found: &[u64], expected: &[u64]) -> String {
 fn a_write_is_not_confirmed_by_its_own_echo() {
     let peer = Peer::on_a_pseudo_terminal();
     peer.misbehave(|asked, good| vec![Step::Say(asked.frame.clone()), Step::Pause(4), Step::Say(good)]);
-    let gateway = Gateway::start(&peer, MIXED);
-    gateway.observer.wait_for("busker/one/relay", "OFF");
-    assert_eq!(gateway.set_relay("ON")["outcome"], "done");
-    gateway.observer.wait_for("busker/one/relay", "ON");
+    let stage = Stage::start(&peer, MIXED);
+    stage.watcher.shows("busker/one/relay", "OFF");
+    assert_eq!(stage.set_relay("ON")["outcome"], "done");
+    stage.watcher.shows("busker/one/relay", "ON");
 
     // The unit does not hear writes any more, but the adapter still returns them.
     peer.be_deaf_to_writes();
-    let outcome = gateway.set_relay("OFF");
+    let outcome = stage.set_relay("OFF");
     assert_ne!(outcome["outcome"], "done", "{outcome}");
     peer.hold(1, 4, 0, 101);
-    gateway.observer.wait_for("busker/one/a", "101");
-    let told: Vec<String> = gateway.observer.payloads("busker/one/relay");
+    stage.watcher.shows("busker/one/a", "101");
+    let told: Vec<String> = stage.watcher.payloads("busker/one/relay");
     assert_eq!(told.last().map(String::as_str), Some("ON"), "{told:?}");
     assert_eq!(told.iter().filter(|payload| *payload == "OFF").count(), 1, "only at first: {told:?}");
 }
@@ -264,43 +264,43 @@ fn a_write_is_not_confirmed_by_its_own_echo() {
 #[test]
 fn an_adapter_may_be_unplugged_and_plugged_in_again() {
     let peer = Peer::on_a_pseudo_terminal();
-    let gateway = Gateway::start(&peer, MIXED);
-    gateway.observer.wait_for("busker/one/a", "100");
+    let stage = Stage::start(&peer, MIXED);
+    stage.watcher.shows("busker/one/a", "100");
     for truth in [101, 102] {
         peer.unplug();
-        gateway.observer.wait_for("busker/one/availability", "offline");
+        stage.watcher.shows("busker/one/availability", "offline");
         let reason = wait_for("the bus to be down", || {
-            let bus = gateway.bus()?;
+            let bus = stage.bus()?;
             (bus["up"] == false).then(|| bus["reason"].as_str().unwrap_or_default().to_owned())
         });
         assert!(reason == "unplugged" || reason.contains("is the adapter plugged in?"), "{reason}");
         peer.hold(1, 4, 0, truth);
         peer.plug_in();
-        gateway.observer.wait_for("busker/one/availability", "online");
-        gateway.observer.wait_for("busker/one/a", &truth.to_string());
+        stage.watcher.shows("busker/one/availability", "online");
+        stage.watcher.shows("busker/one/a", &truth.to_string());
     }
-    assert_eq!(gateway.values("busker/one/a"), [100, 101, 102]);
+    assert_eq!(stage.values("busker/one/a"), [100, 101, 102]);
 }
 
 #[test]
 fn an_adapter_that_comes_back_under_another_name_is_found_by_its_link() {
     let peer = Peer::on_a_pseudo_terminal();
-    let gateway = Gateway::start(&peer, MIXED);
-    gateway.observer.wait_for("busker/one/a", "100");
+    let stage = Stage::start(&peer, MIXED);
+    stage.watcher.shows("busker/one/a", "100");
     let old_name = std::fs::read_link(peer.path()).expect("the link leads to a port");
-    assert!(gateway.busker.open_files().contains(&old_name));
+    assert!(stage.gateway.open_files().contains(&old_name));
 
-    let from = gateway.observer.count();
+    let from = stage.watcher.count();
     peer.unplug();
-    gateway.observer.wait_for("busker/one/availability", "offline");
+    stage.watcher.shows("busker/one/availability", "offline");
     for topic in ["busker/one/a", "busker/one/relay", "busker/two/a"] {
-        gateway.observer.wait_for(topic, "None");
+        stage.watcher.shows(topic, "None");
     }
-    let info = gateway.observer.payloads("busker/one/info").pop().expect("it has been told");
+    let info = stage.watcher.payloads("busker/one/info").pop().expect("it has been told");
     assert!(info.contains("the link is down: unplugged"), "{info}");
     // The name is free again as soon as the adapter is gone: held, it would force another one on it.
     let held = |held: &std::path::PathBuf| held.to_string_lossy().starts_with(&*old_name.to_string_lossy());
-    assert!(!gateway.busker.open_files().iter().any(held), "{old_name:?} is still held open");
+    assert!(!stage.gateway.open_files().iter().any(held), "{old_name:?} is still held open");
 
     // Another one has the old name meanwhile.
     let taken = peer::Placeholder::take(&old_name);
@@ -308,11 +308,11 @@ fn an_adapter_that_comes_back_under_another_name_is_found_by_its_link() {
     peer.plug_in();
     let new_name = std::fs::read_link(peer.path()).expect("the link leads to a port");
     assert_ne!(new_name, old_name);
-    gateway.observer.wait_for("busker/one/availability", "online");
-    gateway.observer.wait_for("busker/one/a", "101");
-    gateway.observer.wait_for("busker/two/a", "700");
+    stage.watcher.shows("busker/one/availability", "online");
+    stage.watcher.shows("busker/one/a", "101");
+    stage.watcher.shows("busker/two/a", "700");
     drop(taken);
-    let seen = gateway.observer.seen();
+    let seen = stage.watcher.received();
     let told = seen[from..].iter().filter(|seen| seen.topic == "busker/one/a").map(|seen| &*seen.payload);
     assert_eq!(told.collect::<Vec<_>>(), ["None", "101"], "nothing else in between");
 }
@@ -323,8 +323,8 @@ fn a_request_that_comes_back_damaged_has_collided_and_is_asked_again() {
     let echoed: Misbehave =
         |asked, good| vec![Step::Say(asked.frame.clone()), Step::Pause(4), Step::Say(good)];
     peer.misbehave(echoed);
-    let gateway = Gateway::start(&peer, MIXED);
-    gateway.observer.wait_for("busker/one/a", "100");
+    let stage = Stage::start(&peer, MIXED);
+    stage.watcher.shows("busker/one/a", "100");
     // What another master asks of the same unit at the same time is answered; it looks like our reply.
     let collisions: [Misbehave; 3] = [
         |asked, _| {
@@ -334,44 +334,44 @@ fn a_request_that_comes_back_damaged_has_collided_and_is_asked_again() {
         |asked, _| vec![Step::Say(asked.frame[..3].to_vec())],
     ];
     for (count, how) in (1..).zip(collisions) {
-        let from = gateway.observer.count();
+        let from = stage.watcher.count();
         peer.misbehave_once(1, 4, 0, how);
         peer.hold(1, 4, 0, 100 + count);
-        assert_eq!(gateway.observer.wait_for_next("busker/one/a", from), (100 + count).to_string());
-        wait_for("the collision to be counted", || (gateway.bus()?["collisions"] == count).then_some(()));
+        assert_eq!(stage.watcher.wait_for_next("busker/one/a", from), (100 + count).to_string());
+        wait_for("the collision to be counted", || (stage.bus()?["collisions"] == count).then_some(()));
     }
-    assert_eq!(gateway.values("busker/one/a"), [100, 101, 102, 103]);
-    assert!(!gateway.observer.payloads("busker/one/availability")[1..].contains(&"offline".to_string()));
-    let bus = wait_for("the API", || gateway.bus());
+    assert_eq!(stage.values("busker/one/a"), [100, 101, 102, 103]);
+    assert!(!stage.watcher.payloads("busker/one/availability")[1..].contains(&"offline".to_string()));
+    let bus = wait_for("the API", || stage.bus());
     assert_eq!((&bus["timeouts"], &bus["checksum_errors"]), (&0.into(), &0.into()), "{bus}");
 
     // A write whose echo is damaged is not confirmed by what follows, but by what the unit holds.
     peer.misbehave_once(1, 5, 0, |asked, good| {
         vec![Step::Say(changed(asked.frame.clone(), |frame| frame[2] ^= 1)), Step::Pause(30), Step::Say(good)]
     });
-    assert_eq!(gateway.set_relay("ON")["outcome"], "done");
-    wait_for("the collision to be counted", || (gateway.bus()?["collisions"] == 4).then_some(()));
+    assert_eq!(stage.set_relay("ON")["outcome"], "done");
+    wait_for("the collision to be counted", || (stage.bus()?["collisions"] == 4).then_some(()));
 }
 
 #[test]
 fn a_second_master_is_told_and_the_link_stays() {
     let peer = Peer::on_a_pseudo_terminal();
-    let gateway = Gateway::start(&peer, MIXED);
-    gateway.observer.wait_for("busker/one/a", "100");
+    let stage = Stage::start(&peer, MIXED);
+    stage.watcher.shows("busker/one/a", "100");
     peer.misbehave_once(1, 4, 0, |_, good| {
         let others = [rtu(7, &[3, 0, 0, 0, 2]), rtu(7, &read_pdu(3, &[LIE, LIE])), rtu(7, &[3, 0, 2, 0, 2])];
         let said = others.into_iter().flat_map(|frame| [Step::Pause(10), Step::Say(frame)]);
         [Step::Say(good)].into_iter().chain(said).collect()
     });
     let told = "another master speaks on this line: 2 requests to unit 7 in the last minute";
-    let bus = wait_for("the second master to be told", || gateway.bus().filter(|bus| bus["reason"] == told));
+    let bus = wait_for("the second master to be told", || stage.bus().filter(|bus| bus["reason"] == told));
     assert_eq!((&bus["up"], &bus["foreign_frames"]), (&true.into(), &3.into()), "{bus}");
-    let health = wait_for("the health", || gateway.busker.json("/health"));
+    let health = wait_for("the health", || stage.gateway.json("/health"));
     assert_eq!(health["buses"]["line"]["reason"], told);
-    assert!(gateway.busker.log().contains(&format!("bus line: {told}")));
+    assert!(stage.gateway.has_said(&format!("bus line: {told}")));
     peer.hold(1, 4, 0, 101);
-    gateway.observer.wait_for("busker/one/a", "101");
-    assert_eq!(gateway.values("busker/one/a"), [100, 101]);
+    stage.watcher.shows("busker/one/a", "101");
+    assert_eq!(stage.values("busker/one/a"), [100, 101]);
 }
 
 /// Two units, with points of several kinds.
@@ -403,25 +403,25 @@ const ALIKE: &str = "  one:
 ";
 
 /// The program on a peer's line, with a few devices.
-struct Gateway {
+struct Stage {
     // In the order in which they end.
-    busker: Busker,
-    observer: Observer,
-    _broker: Mosquitto,
+    gateway: Gateway,
+    watcher: Watcher,
+    _broker: Broker,
 }
 
-impl Gateway {
-    fn start(peer: &Peer, devices: &str) -> Gateway {
-        Gateway::start_with(peer, "", devices)
+impl Stage {
+    fn start(peer: &Peer, devices: &str) -> Stage {
+        Stage::start_with(peer, "", devices)
     }
 
     /// With more lines of configuration.
-    fn start_with(peer: &Peer, sections: &str, devices: &str) -> Gateway {
+    fn start_with(peer: &Peer, sections: &str, devices: &str) -> Stage {
         peer.hold(1, 4, 0, 100);
         peer.hold(1, 4, 100, 500);
         peer.hold(2, 4, 0, 700);
-        let broker = Mosquitto::start();
-        let observer = Observer::of(&broker);
+        let broker = Broker::start();
+        let watcher = Watcher::start(&broker, "watcher");
         let configuration = format!(
             "home_assistant: {{discovery: false}}
 {sections}buses:
@@ -430,12 +430,12 @@ devices:
 {devices}",
             peer.link()
         );
-        let busker = Busker::run(&broker, &configuration);
-        Gateway { busker, observer, _broker: broker }
+        let gateway = Gateway::start(&broker, &configuration);
+        Stage { gateway, watcher, _broker: broker }
     }
 
     fn bus(&self) -> Option<Value> {
-        self.busker.json("/api/buses")?.get(0).cloned()
+        self.gateway.json("/api/buses")?.get(0).cloned()
     }
 
     /// In the order of [`FAULTS`].
@@ -446,7 +446,7 @@ devices:
 
     /// Every value that was published, without `None` and without repetitions.
     fn values(&self, topic: &str) -> Vec<u64> {
-        let payloads = self.observer.payloads(topic);
+        let payloads = self.watcher.payloads(topic);
         let numbers = payloads.iter().filter(|payload| *payload != "None");
         let mut values: Vec<u64> = numbers.map(|payload| payload.parse().expect("a number")).collect();
         values.dedup();
@@ -454,9 +454,9 @@ devices:
     }
 
     fn set_relay(&self, wanted: &str) -> Value {
-        let from = self.observer.count();
-        self.observer.publish("busker/one/relay/set", wanted);
-        let outcome = self.observer.wait_for_next("busker/one/relay/outcome", from);
+        let from = self.watcher.count();
+        self.watcher.publish("busker/one/relay/set", wanted);
+        let outcome = self.watcher.wait_for_next("busker/one/relay/outcome", from);
         serde_json::from_str(&outcome).expect("an outcome is JSON")
     }
 }

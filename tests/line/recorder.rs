@@ -10,16 +10,16 @@ use serde_json::{Value, json};
 use crate::pcapng::{self, Packet, Pcapng};
 use crate::peer::{Framing, Peer, Step, read_pdu, reply, rtu};
 use crate::support::wait_for;
-use crate::{Gateway, MIXED, changed, lie};
+use crate::{MIXED, Stage, changed, lie};
 
 /// Units 1 and 2 have given their first values, a command was obeyed, and then unit 1 has sent a damaged
 /// answer and been silent once.
-fn trouble(peer: &Peer) -> Gateway {
-    let gateway = Gateway::start(peer, MIXED);
-    gateway.observer.wait_for("busker/one/a", "100");
-    gateway.observer.wait_for("busker/two/a", "700");
-    gateway.observer.wait_for("busker/one/relay", "OFF");
-    assert_eq!(gateway.set_relay("ON")["outcome"], "done");
+fn trouble(peer: &Peer) -> Stage {
+    let stage = Stage::start(peer, MIXED);
+    stage.watcher.shows("busker/one/a", "100");
+    stage.watcher.shows("busker/two/a", "700");
+    stage.watcher.shows("busker/one/relay", "OFF");
+    assert_eq!(stage.set_relay("ON")["outcome"], "done");
     if peer.link().contains("tcp: ") && !peer.link().contains("rtu") {
         peer.misbehave_once(1, 4, 0, |asked, _| {
             vec![Step::Say(reply(asked, Framing::Tcp, &read_pdu(4, &[9999, 9999])))]
@@ -35,27 +35,27 @@ fn trouble(peer: &Peer) -> Gateway {
     }
     wait_for("the misbehaviour", || peer.has_misbehaved().then_some(()));
     peer.hold(1, 4, 0, 101);
-    gateway.observer.wait_for("busker/one/a", "101");
+    stage.watcher.shows("busker/one/a", "101");
     peer.misbehave_once(1, 4, 100, |_, _| vec![]);
     wait_for("the silence", || peer.has_misbehaved().then_some(()));
     peer.hold(1, 4, 100, 501);
-    gateway.observer.wait_for("busker/one/b", "501");
-    gateway
+    stage.watcher.shows("busker/one/b", "501");
+    stage
 }
 
-fn record(gateway: &Gateway, request: &Value) -> Value {
-    let from = gateway.observer.count();
-    gateway.observer.publish("busker/bridge/request/record", &request.to_string());
-    let answer = gateway.observer.wait_for_next("busker/bridge/response/record", from);
+fn record(stage: &Stage, request: &Value) -> Value {
+    let from = stage.watcher.count();
+    stage.watcher.publish("busker/bridge/request/record", &request.to_string());
+    let answer = stage.watcher.wait_for_next("busker/bridge/response/record", from);
     serde_json::from_str(&answer).expect("an answer is JSON")
 }
 
 /// The file of a request, and where it is.
-fn recorded(gateway: &Gateway) -> (Pcapng, PathBuf) {
-    let answer = record(gateway, &json!({"bus": "line", "transaction": 7}));
+fn recorded(stage: &Stage) -> (Pcapng, PathBuf) {
+    let answer = record(stage, &json!({"bus": "line", "transaction": 7}));
     assert_eq!((&answer["status"], &answer["transaction"]), (&json!("ok"), &json!(7)), "{answer}");
     let path = PathBuf::from(answer["data"]["file"].as_str().expect("a path"));
-    assert!(path.starts_with(gateway.busker.folder().join("recordings")), "{}", path.display());
+    assert!(path.starts_with(stage.gateway.state().join("recordings")), "{}", path.display());
     let file = pcapng::read(&fs::read(&path).expect("the file is there"));
     assert_eq!(answer["data"]["frames"], file.packets.len(), "{answer}");
     (file, path)
@@ -87,8 +87,8 @@ fn check_order(file: &Pcapng) {
 #[test]
 fn what_was_on_a_serial_line_is_saved_on_request_with_what_was_wrong_with_it() {
     let peer = Peer::on_a_pseudo_terminal();
-    let gateway = trouble(&peer);
-    let (file, _) = recorded(&gateway);
+    let stage = trouble(&peer);
+    let (file, _) = recorded(&stage);
     let link = format!("serial {} 115200 8N1", peer.path().display());
     assert_eq!((file.link_type, file.interface.as_str(), &file.description), (252, "line", &link));
     assert_eq!(file.comment, format!("bus line, {link}: on request"));
@@ -112,8 +112,8 @@ fn what_was_on_a_serial_line_is_saved_on_request_with_what_was_wrong_with_it() {
 #[test]
 fn what_was_on_a_connection_is_saved_on_request_with_what_was_wrong_with_it() {
     let peer = Peer::on_tcp(Framing::Tcp);
-    let gateway = trouble(&peer);
-    let (file, _) = recorded(&gateway);
+    let stage = trouble(&peer);
+    let (file, _) = recorded(&stage);
     assert_eq!((file.link_type, file.interface.as_str()), (252, "line"));
     check_order(&file);
     let (first, second) = asked(&file, &[1, 4, 0, 0, 0, 1]);
@@ -127,9 +127,9 @@ fn what_was_on_a_connection_is_saved_on_request_with_what_was_wrong_with_it() {
 #[test]
 fn over_http_there_is_the_same_without_a_file() {
     let peer = Peer::on_tcp(Framing::Rtu);
-    let gateway = trouble(&peer);
+    let stage = trouble(&peer);
     let path = "/api/buses/line/frames.pcapng";
-    let (bytes, name) = gateway.busker.download(path, "content-disposition").expect("a download");
+    let (bytes, name) = stage.gateway.download(path, "content-disposition").expect("a download");
     assert!(name.starts_with("attachment; filename=\"line-20") && name.ends_with("Z.pcapng\""), "{name}");
     let file = pcapng::read(&bytes);
     assert!(file.comment.ends_with(": on request over HTTP"), "{}", file.comment);
@@ -137,21 +137,17 @@ fn over_http_there_is_the_same_without_a_file() {
     noted(&file, "no answer in time");
     noted(&file, "damaged: wrong checksum");
     assert_eq!(file.packets[0].tag(12), b"mbrtu\0\0\0");
-    assert!(gateway.busker.get("/api/buses/roof/frames.pcapng").expect("an answer").contains("no such bus"));
+    assert!(stage.gateway.get("/api/buses/roof/frames.pcapng").1.contains("no such bus"));
 }
 
 #[test]
 fn something_that_goes_wrong_leaves_a_file_by_itself_and_not_one_for_each() {
     let peer = Peer::on_a_pseudo_terminal();
-    let gateway = trouble(&peer);
-    let folder = gateway.busker.folder().join("recordings");
+    let stage = trouble(&peer);
+    let folder = stage.gateway.state().join("recordings");
     let files = || names(&folder).into_iter().filter(|name| name.ends_with(".pcapng")).collect::<Vec<_>>();
     let name = wait_for("a recording", || files().pop());
-    let log = wait_for("the log to tell it", || {
-        let log = gateway.busker.log();
-        log.contains(&name).then_some(log)
-    });
-    let line = log.lines().find(|line| line.contains(&name)).expect("it was found");
+    let line = stage.gateway.wait_for_log(&name);
     assert!(line.contains("bus line: a damaged answer, while one was asked; the last "), "{line}");
     let file = pcapng::read(&fs::read(folder.join(&name)).expect("the file is there"));
     assert!(file.comment.ends_with(": a damaged answer, while one was asked"), "{}", file.comment);
@@ -159,21 +155,21 @@ fn something_that_goes_wrong_leaves_a_file_by_itself_and_not_one_for_each() {
     let behind = file.packets.len() - damaged.expect("the damaged frame");
     assert!(behind > 10, "what followed is in it too, and not only {behind} frames");
     // The silence that came after it is too soon for another.
-    recorded(&gateway);
+    recorded(&stage);
     assert_eq!(files().len(), 2, "{:?}", files());
 }
 
 #[test]
 fn what_is_turned_off_is_not_recorded() {
     let peer = Peer::on_a_pseudo_terminal();
-    let gateway = Gateway::start_with(&peer, "recorder: {kilobytes: 0}\n", MIXED);
-    gateway.observer.wait_for("busker/one/a", "100");
-    let answer = record(&gateway, &json!({"device": "one"}));
+    let stage = Stage::start_with(&peer, "recorder: {kilobytes: 0}\n", MIXED);
+    stage.watcher.shows("busker/one/a", "100");
+    let answer = record(&stage, &json!({"device": "one"}));
     let reason = "nothing is recorded; the configuration says `kilobytes: 0` under `recorder`";
     assert_eq!((&answer["status"], &answer["error"]), (&json!("error"), &json!(reason)), "{answer}");
-    let told = gateway.busker.get("/api/buses/line/frames.pcapng");
-    assert_eq!(told.expect("an answer").trim(), reason);
-    assert!(!gateway.busker.folder().join("recordings").exists());
+    let told = stage.gateway.get("/api/buses/line/frames.pcapng");
+    assert_eq!(told.1.trim(), reason);
+    assert!(!stage.gateway.state().join("recordings").exists());
 }
 
 fn names(folder: &Path) -> Vec<String> {
@@ -203,8 +199,8 @@ fn count(packets: &[Vec<String>], expected: &[&str]) -> usize {
 #[ignore = "needs tshark, 128 MB: `make test-wireshark`"]
 fn wireshark_reads_a_serial_line_and_its_checksums() {
     let peer = Peer::on_a_pseudo_terminal();
-    let gateway = trouble(&peer);
-    let (file, path) = recorded(&gateway);
+    let stage = trouble(&peer);
+    let (file, path) = recorded(&stage);
     // As it opens: everything but the checksums, and which way a write of one coil goes.
     let fields = [
         "ip.src",
@@ -236,8 +232,8 @@ fn wireshark_reads_a_serial_line_and_its_checksums() {
 #[ignore = "needs tshark, 128 MB: `make test-wireshark`"]
 fn wireshark_reads_modbus_tcp() {
     let peer = Peer::on_tcp(Framing::Tcp);
-    let gateway = trouble(&peer);
-    let (file, path) = recorded(&gateway);
+    let stage = trouble(&peer);
+    let (file, path) = recorded(&stage);
     let fields = [
         "_ws.col.Protocol",
         "mbtcp.trans_id",

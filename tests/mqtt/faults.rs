@@ -9,8 +9,9 @@ use busker::engine::time::Duration;
 use busker::simulator::{Simulation, TcpPort};
 
 use super::proxy::Proxy;
-use super::rig::{self, Broker, Gateway, Watcher};
 use super::{configuration, json, over_tcp, relay, remembered, simulation, table};
+use crate::clients;
+use crate::support::{self, Broker, Gateway, Received, Watcher};
 
 const DOCUMENT: &str = "docs/reliability.md";
 
@@ -100,7 +101,7 @@ const ROWS: &[Row] = &[
             // A session of the gateway's own identifier that the broker shall keep.
             stage.proxy.refuse();
             stage.meanwhile();
-            rig::leave_a_session(&stage.broker, "busker_gateway", "busker/+/+/set");
+            clients::leave_a_session(&stage.broker, "busker_gateway", "busker/+/+/set");
             stage.watcher.publish("busker/relays/relay_1/set", "ON");
             stage.watcher.publish_retained("busker/relays/relay_1/set", "ON");
             stage.watcher.wait_for("busker/relays/relay_1/set", "ON");
@@ -142,7 +143,7 @@ const ROWS: &[Row] = &[
             stage.proxy.wait_until_told(b"busker/relays/relay_3");
             thread::sleep(Duration::from_millis(3500));
             stage.broker.go_on();
-            let is_told = |got: &rig::Received| got.topic == "busker/relays/relay_1/outcome";
+            let is_told = |got: &Received| got.topic == "busker/relays/relay_1/outcome";
             stage.watcher.wait_until("the outcome", is_told);
             assert_eq!(stage.connects(), connects, "the connection is the same");
             // What comes right behind a stall may have been sent in it.
@@ -161,7 +162,7 @@ const ROWS: &[Row] = &[
             // Somebody stands in the queue behind the gateway.
             stage.proxy.forget_told();
             stage.proxy.wait_until_told(b"MQTT");
-            let late = rig::queue_up(&stage.broker, "busker/relays/relay_1/set", "ON");
+            let late = clients::queue_up(&stage.broker, "busker/relays/relay_1/set", "ON");
             stage.broker.go_on();
             late.join().expect("it is published");
         },
@@ -189,7 +190,7 @@ const ROWS: &[Row] = &[
             stage.watcher.publish("busker/relays/relay_1/set", "ON");
             stage.meanwhile();
             let before = stage.proxy.accepted();
-            rig::eventually(|| (stage.proxy.accepted() >= before + 2).then_some(())).expect("it tries again");
+            support::find(|| (stage.proxy.accepted() >= before + 2).then_some(())).expect("it tries again");
             stage.proxy.open();
         },
     },
@@ -203,7 +204,7 @@ const ROWS: &[Row] = &[
                 let before = stage.proxy.accepted();
                 stage.proxy.cut_after(Some(bytes), None);
                 stage.proxy.cut();
-                rig::eventually(|| (stage.proxy.accepted() > before).then_some(())).expect("it tries again");
+                support::find(|| (stage.proxy.accepted() > before).then_some(())).expect("it tries again");
             }
             stage.meanwhile();
             stage.proxy.open();
@@ -219,7 +220,7 @@ const ROWS: &[Row] = &[
                 let before = stage.proxy.accepted();
                 stage.proxy.cut_after(None, Some(bytes));
                 stage.proxy.cut();
-                rig::eventually(|| (stage.proxy.accepted() > before).then_some(())).expect("it tries again");
+                support::find(|| (stage.proxy.accepted() > before).then_some(())).expect("it tries again");
             }
             stage.meanwhile();
             stage.proxy.open();
@@ -238,7 +239,7 @@ const ROWS: &[Row] = &[
             stage.gateway.stall();
             stage.proxy.pass_last_words();
             stage.gateway.go_on();
-            let obeyed = rig::eventually(|| (relay(&stage.simulation, 1) == "ON").then_some(()));
+            let obeyed = support::find(|| (relay(&stage.simulation, 1) == "ON").then_some(()));
             obeyed.expect("the command came in time");
             stage.meanwhile();
             stage.proxy.open();
@@ -402,7 +403,7 @@ impl Stage {
     #[track_caller]
     fn wait_for_connects(&self, count: u64) {
         let connected = || (self.connects() >= count).then_some(());
-        rig::eventually(connected).unwrap_or_else(|| panic!("{}", self.gateway.log().join("\n")));
+        support::find(connected).unwrap_or_else(|| panic!("{}", self.gateway.log().join("\n")));
     }
 
     /// What the broker remembers, by topic.
@@ -415,7 +416,7 @@ impl Stage {
     /// What of this the broker does not come to remember, and what it should not.
     fn lost(&self, expected: &BTreeMap<String, String>) -> Vec<String> {
         let mut lost = Vec::new();
-        let _ = rig::eventually(|| {
+        let _ = support::find(|| {
             let found = self.retained("after");
             let is_wrong = |topic: &&String| match found.get(*topic) {
                 // They tell counts and times.

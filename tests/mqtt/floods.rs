@@ -7,7 +7,7 @@ use busker::engine::time::Duration;
 use busker::simulator::{DeviceAt, Framing, Model, Options, Simulation, TcpPort};
 
 use super::json;
-use super::rig::{self, Broker, Gateway, Watcher};
+use crate::support::{self, Broker, Gateway, Received, Watcher};
 
 const BURST: usize = 1000;
 
@@ -48,7 +48,7 @@ impl Bench {
             self.watcher.publish(&format!("busker/valves/{point}/set"), value);
         }
         let outcomes = || self.watcher.payloads(&format!("busker/valves/{point}/outcome"));
-        let all = rig::eventually(|| (outcomes().len() >= values.len()).then_some(()));
+        let all = support::find(|| (outcomes().len() >= values.len()).then_some(()));
         assert!(all.is_some(), "{} outcomes of {} commands", outcomes().len(), values.len());
         let mut answered: Vec<String> = Vec::new();
         let mut kinds: BTreeMap<String, usize> = BTreeMap::new();
@@ -118,9 +118,8 @@ fn a_script_that_floods_what_is_kept_in_eeprom_writes_once_in_an_interval() {
     // Counted for the installation, and shown to Home Assistant.
     let config = bench.watcher.received();
     assert!(config.iter().all(|got| !got.topic.ends_with("/config")), "nothing is announced anew for it");
-    let told = |got: &rig::Received| {
-        got.topic == "busker/valves/info" && json(&got.payload)["eeprom_writes"] == writes
-    };
+    let told =
+        |got: &Received| got.topic == "busker/valves/info" && json(&got.payload)["eeprom_writes"] == writes;
     bench.watcher.wait_until("the count in the info", told);
 }
 

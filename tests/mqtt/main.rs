@@ -1,5 +1,6 @@
 //! The whole program between simulated devices and a real broker.
 
+mod clients;
 mod faults;
 mod floods;
 mod manners;
@@ -8,8 +9,9 @@ mod orphans;
 mod proxy;
 mod reload;
 mod requests;
-mod rig;
 mod secure;
+#[path = "../support/mod.rs"]
+mod support;
 #[path = "../support/table.rs"]
 mod table;
 mod watching;
@@ -24,7 +26,7 @@ use busker::engine::time::Duration;
 use busker::simulator::{DeviceAt, Framing, Model, Options, Simulation, TcpPort};
 use serde_json::Value as Json;
 
-use rig::{Broker, Gateway, Received, Watcher};
+use support::{Broker, Gateway, Received, Watcher};
 
 /// A relay module with unit 18 and a counter module with unit 20.
 fn simulation() -> Simulation {
@@ -241,7 +243,7 @@ fn a_flood_of_commands_ends_with_the_newest_and_leaves_the_gateway_well() {
             && json(&got.payload)["outcome"] == "done"
             && json(&got.payload)["wanted"] == "ON"
     });
-    rig::eventually(|| (relay(&simulation, 3) == "ON").then_some(())).expect("the newest has won");
+    support::find(|| (relay(&simulation, 3) == "ON").then_some(())).expect("the newest has won");
     gateway.wait_for_health(200);
     let (_, metrics) = gateway.get("/metrics");
     let writes = metrics
@@ -332,8 +334,7 @@ fn what_the_configuration_has_no_more_is_taken_from_home_assistant() {
         watcher.received().into_iter().filter(|got| got.topic == config).map(|got| got.payload).collect()
     };
     let is_without = |payload: &String| json(payload)["components"].get("two").is_none();
-    rig::eventually(|| told().last().is_some_and(is_without).then_some(()))
-        .expect("it ends without the point");
+    support::find(|| told().last().is_some_and(is_without).then_some(())).expect("it ends without the point");
     let told = told();
     let at = told.iter().position(|payload| json(payload)["components"]["two"] == tombstone);
     let at = at.expect("it was buried");
@@ -387,7 +388,7 @@ E/hZue7W5k918I4FS8G53PMCS/qjssXbAFlKHAqCMycxZVLVqN+w0FWxALcZUZnXHN79lYWz/wzftKwo
 #[test]
 fn a_broker_that_wants_a_password_gets_it_and_no_log_does() {
     let folder = tempfile::tempdir().expect("a folder");
-    let hashes = rig::temporary_file(&folder, "hashes", HASH);
+    let hashes = support::temporary_file(&folder, "hashes", HASH);
     // A mosquitto that is started by root reads it as another user.
     fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).expect("the folder can be opened");
     fs::set_permissions(&hashes, fs::Permissions::from_mode(0o644)).expect("the file can be opened");
@@ -395,7 +396,7 @@ fn a_broker_that_wants_a_password_gets_it_and_no_log_does() {
     let simulation = simulation();
     let port = over_tcp(&simulation);
     let start = |password: &str| {
-        let file = rig::temporary_file(&folder, "password", password);
+        let file = support::temporary_file(&folder, "password", password);
         Gateway::start_with(&format!(
             "mqtt: {{url: 'mqtt://127.0.0.1:{}', username: busker, password_file: {}}}\n{}",
             broker.port,
@@ -442,13 +443,13 @@ fn systemd_is_told_of_start_life_and_end_and_the_journal_stamps_the_lines() {
     let line = gateway.wait_for_log("HTTP on");
     assert!(line.trim_start().starts_with("INFO HTTP on"), "`{line}` has a time of its own");
     assert!(gateway.terminate().success());
-    rig::eventually(|| (next() == "STOPPING=1").then_some(())).expect("the end is told");
+    support::find(|| (next() == "STOPPING=1").then_some(())).expect("the end is told");
 }
 
 #[test]
 fn a_wrong_configuration_starts_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
-    let file = rig::temporary_file(&folder, "busker.yaml", "buses: {line: {tcp: nowhere}}\nfoo: 1\n");
+    let file = support::temporary_file(&folder, "busker.yaml", "buses: {line: {tcp: nowhere}}\nfoo: 1\n");
     let output = Command::new(env!("CARGO_BIN_EXE_busker"))
         .args(["run", "--config"])
         .arg(&file)

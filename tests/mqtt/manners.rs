@@ -3,8 +3,8 @@
 
 use serde_json::Value as Json;
 
-use super::rig::{Broker, Gateway, Received, Watcher};
 use super::{devices_on, json, over_tcp, payload, remembered, simulation};
+use crate::support::{Broker, Gateway, Received, Watcher};
 
 fn start(broker: &Broker, mqtt: &str, link: &str) -> Gateway {
     let url = format!("url: 'mqtt://127.0.0.1:{}'", broker.port);

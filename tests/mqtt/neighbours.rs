@@ -2,8 +2,8 @@
 
 use serde_json::Value as Json;
 
-use super::rig::{self, Broker, Gateway, Received, Watcher};
 use super::{configuration, json, over_tcp, relay, remembered, simulation};
+use crate::support::{self, Broker, Gateway, Received, Watcher};
 
 fn health(gateway: &Gateway) -> Json {
     json(&gateway.get("/health").1)
@@ -66,7 +66,7 @@ fn a_client_identifier_that_is_taken_is_told_once_and_the_pauses_grow() {
     super::wait_until_all_is_online(&watcher);
     let second = Gateway::start(&broker, &configuration(&port));
     let is_contested = |gateway: &Gateway| health(gateway)["broker"]["client_id_taken"] == true;
-    rig::eventually(|| (is_contested(&first) || is_contested(&second)).then_some(())).expect("it is noticed");
+    support::find(|| (is_contested(&first) || is_contested(&second)).then_some(())).expect("it is noticed");
     let (contested, other) = if is_contested(&first) { (first, second) } else { (second, first) };
     let said = "another client has the identifier `busker_gateway`";
     contested.wait_for_log(said);
@@ -94,7 +94,7 @@ fn a_second_gateway_with_the_same_state_dir_does_not_start() {
     let port = over_tcp(&simulation);
     let gateway = Gateway::start(&broker, &configuration(&port));
     let file = gateway.file().display().to_string();
-    let (code, told) = rig::busker(&["run", "--config", &file, "--http", "127.0.0.1:0"], &[]);
+    let (code, told) = support::busker(&["run", "--config", &file, "--http", "127.0.0.1:0"], &[]);
     assert_eq!(code, Some(1), "{told}");
     let expected = format!("another busker (process {}) keeps its state in `", gateway.id());
     assert!(told.contains(&expected) && told.contains("a `state_dir`"), "{told}");
@@ -116,7 +116,7 @@ fn a_second_gateway_with_the_same_state_dir_does_not_start() {
         .collect();
     other.write_whole(&text.join("\n"));
     other.reload("the new configuration is refused, and the old one goes on: another busker");
-    let told = rig::eventually(|| other.get("/health").1.contains("another busker").then_some(()));
+    let told = support::find(|| other.get("/health").1.contains("another busker").then_some(()));
     assert!(told.is_some(), "{:?}", other.get("/health"));
 
     // Killed, it leaves nothing behind that would keep the next one out.

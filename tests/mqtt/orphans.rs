@@ -1,8 +1,8 @@
 //! What is taken out of the configuration while the gateway is off, and the broker forgets meanwhile: Home
 //! Assistant does not forget.
 
-use super::rig::{self, Broker, Gateway, Received, Watcher};
 use super::{json, over_tcp, simulation};
+use crate::support::{self, Broker, Gateway, Received, Watcher};
 
 const RELAYS: &str = "homeassistant/device/busker_relays/config";
 const BOARD: &str = "homeassistant/device/busker_board/config";
@@ -29,7 +29,7 @@ fn nothing_is_left_in_home_assistant_of_what_only_the_gateway_remembers() {
         let stored = std::fs::read_to_string(&remembered).ok()?;
         topics.iter().all(|topic| stored.contains(topic)).then_some(())
     };
-    rig::eventually(|| holds(&[RELAYS, BOARD])).expect("what is announced is remembered");
+    support::find(|| holds(&[RELAYS, BOARD])).expect("what is announced is remembered");
     drop(watcher);
 
     let mut watcher = None;
@@ -60,7 +60,7 @@ fn nothing_is_left_in_home_assistant_of_what_only_the_gateway_remembers() {
     let is_buried =
         |got: &Received| got.topic == BOARD && json(&got.payload)["components"]["two"] == tombstone;
     watcher.wait_until("the burial of the point", is_buried);
-    let gone = rig::eventually(|| {
+    let gone = support::find(|| {
         let stored = std::fs::read_to_string(&remembered).ok()?;
         (!stored.contains(RELAYS) && stored.contains(BOARD) && !stored.contains("board_two")).then_some(())
     });

@@ -7,7 +7,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use super::rig;
+use crate::support;
 
 /// How often somebody who waits in `read` looks whether the way has changed.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
@@ -98,7 +98,7 @@ impl Proxy {
     pub fn pass_last_words(&self) {
         self.set(|state| state.way = Way::LastWords);
         // Each pump ends its own connection.
-        let ended = rig::eventually(|| self.state().pairs.is_empty().then_some(()));
+        let ended = support::find(|| self.state().pairs.is_empty().then_some(()));
         ended.expect("the connections end");
         self.set(|state| state.way = Way::Refused);
     }
@@ -134,7 +134,7 @@ impl Proxy {
     #[track_caller]
     pub fn wait_until_told(&self, what: &[u8]) {
         let is_told = || self.state().told.windows(what.len()).any(|part| part == what);
-        rig::eventually(|| is_told().then_some(())).expect("the gateway tells it");
+        support::find(|| is_told().then_some(())).expect("the gateway tells it");
     }
 
     /// Waits until `what` lies on one of the sides of a connection that is held.
@@ -151,7 +151,7 @@ impl Proxy {
             let sides = state.pairs.iter().flat_map(|(_, both)| both);
             sides.map(|socket| socket.try_clone().expect("a descriptor")).collect()
         };
-        rig::eventually(|| sides().iter().any(lies).then_some(())).expect("it comes to the proxy");
+        support::find(|| sides().iter().any(lies).then_some(())).expect("it comes to the proxy");
     }
 
     fn state(&self) -> MutexGuard<'_, State> {

@@ -9,7 +9,7 @@ use std::thread;
 use busker::edge::clock::Clock;
 use busker::engine::time::{Duration, Time};
 
-use crate::rig::{Broker, Gateway, Received, Watcher, eventually};
+use crate::support::{Broker, Gateway, Received, Watcher, find};
 use crate::{json, over_tcp, remembered, simulation};
 
 /// A server of Modbus TCP that answers every read with zeros and remembers when it was asked.
@@ -42,7 +42,7 @@ impl Witness {
 
     fn wait_for_more(&self, more: usize) {
         let wanted = self.count() + more;
-        eventually(|| (self.count() >= wanted).then_some(())).expect("polls go on");
+        find(|| (self.count() >= wanted).then_some(())).expect("polls go on");
     }
 
     /// The longest time between two questions, from the question number `from` on.
@@ -321,8 +321,8 @@ fn http_moves_to_another_address() {
     let lines = gateway.log();
     let moved = lines.iter().rev().find_map(|line| line.split("HTTP on ").nth(1)).expect("its address");
     let status = |url: &str| ureq::get(url).call().map(|answer| answer.status().as_u16()).ok();
-    eventually(|| (status(moved) == Some(200)).then_some(())).expect("HTTP answers at its new address");
-    eventually(|| status(&format!("{}/health", gateway.http())).is_none().then_some(()))
+    find(|| (status(moved) == Some(200)).then_some(())).expect("HTTP answers at its new address");
+    find(|| status(&format!("{}/health", gateway.http())).is_none().then_some(()))
         .expect("and not at the old one");
     // The same port by another name, and with a token.
     let port = moved.split('/').nth(2).and_then(|host| host.rsplit(':').next()).expect("its port");
@@ -336,5 +336,5 @@ fn http_moves_to_another_address() {
     assert_eq!(with_token.expect("the token is known").status().as_u16(), 200);
     gateway.write_whole(&at("null"));
     gateway.reload(DONE);
-    eventually(|| status(moved).is_none().then_some(())).expect("HTTP is off");
+    find(|| status(moved).is_none().then_some(())).expect("HTTP is off");
 }

@@ -5,7 +5,7 @@ use busker::engine::settings::{self, Line, Parity};
 use busker::simulator::{DeviceAt, Model, Options, Simulation};
 use serde_json::{Value as Json, json};
 
-use crate::rig::{Broker, Gateway, Watcher};
+use crate::support::{Broker, Gateway, Watcher};
 use crate::{configuration, json, over_tcp, relay, simulation, wait_until_all_is_online};
 
 /// Asks, and waits for the answer to that very request.

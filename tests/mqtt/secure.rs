@@ -19,8 +19,8 @@ use tempfile::TempDir;
 use tungstenite::Message;
 use tungstenite::handshake::server::{Request, Response};
 
-use super::rig::{self, Broker, Gateway, Watcher};
 use super::{configuration, json, over_tcp, simulation};
+use crate::support::{self, Broker, Gateway, Watcher};
 
 /// An authority and what it vouches for, each as `<name>.pem` and `<name>.key` in a folder.
 struct Authority {
@@ -108,8 +108,8 @@ fn a_broker_proves_itself_to_an_own_authority_and_the_gateway_to_the_broker() {
 fn certificates_and_passwords_that_are_renewed_are_used_without_a_restart() {
     let old = Authority::new("old");
     old.vouch_for("server", "localhost");
-    let hashes = rig::temporary_file(&old.folder, "hashes", super::HASH);
-    let password = rig::temporary_file(&old.folder, "password", "old sesame");
+    let hashes = support::temporary_file(&old.folder, "hashes", super::HASH);
+    let password = support::temporary_file(&old.folder, "password", "old sesame");
     let more = format!("allow_anonymous false\npassword_file {}\n", hashes.display());
     let lines = old.broker("server", "").replace("allow_anonymous true\n", &more);
     let mut broker = Broker::start_with(&lines);
@@ -186,7 +186,7 @@ fn files_of_tls_are_read_when_the_configuration_is_checked() {
         let text =
             format!("mqtt:\n  url: mqtts://localhost\n  tls: {{{tls}}}\nbuses: {{b: {{tcp: 'h:1'}}}}\n");
         fs::write(&config, text).expect("a file");
-        rig::busker(&[verb, "--config", config.to_str().expect("text")], &[])
+        support::busker(&[verb, "--config", config.to_str().expect("text")], &[])
     };
     // Relative to the configuration.
     let (code, said) = check("ca_file: ca.pem, cert_file: gateway.pem, key_file: gateway.key", "check");
@@ -306,11 +306,11 @@ fn a_websocket_leads_to_the_broker_again_and_again_with_and_without_tls() {
 #[test]
 fn a_password_may_come_from_the_environment_or_from_systemd() {
     let folder = tempfile::tempdir().expect("a folder");
-    let hashes = rig::temporary_file(&folder, "hashes", super::HASH);
+    let hashes = support::temporary_file(&folder, "hashes", super::HASH);
     let broker = Broker::start_with(&format!("allow_anonymous false\npassword_file {}\n", hashes.display()));
     let simulation = simulation();
     let port = over_tcp(&simulation);
-    rig::temporary_file(&folder, "mqtt-password", "open sesame\n");
+    support::temporary_file(&folder, "mqtt-password", "open sesame\n");
     let credentials = ("CREDENTIALS_DIRECTORY", folder.path().to_str().expect("text"));
     let variable = |password| ("BUSKER_MQTT_PASSWORD", password);
     // Also the libraries say all that they can, and no password.

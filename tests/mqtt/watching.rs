@@ -6,8 +6,8 @@ use serde_json::Value as Json;
 use ureq::http::Response;
 use ureq::{Agent, Body};
 
-use super::rig::{Broker, Gateway, Watcher};
 use super::{configuration, json, over_tcp, simulation, wait_until_all_is_online};
+use crate::support::{Broker, Gateway, Watcher};
 
 const TOKEN: &str = "s3cret-of-the-test";
 

@@ -6,17 +6,16 @@ mod support;
 
 use std::fs::{self, File};
 use std::io::Write;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
 
 use busker::engine::profile::Library;
 use busker::simulator::{DeviceAt, Framing, Model, Options, Simulation, TcpPort};
 use rustix::fs::{Mode, OFlags};
-use rustix::process::{Pid, Signal, kill_process};
 use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
 
-use support::{Mosquitto, Observer, free_port, program, wait_for};
+use support::{Broker, Gateway, Watcher, program, wait_for};
 
 const RELAYS: &str = "metz-connect/mr-do4";
 const METERS: &str = "metz-connect/mr-si4";
@@ -206,71 +205,29 @@ fn nothing_is_written_to_another_device_nor_from_a_faulty_file() {
     assert_eq!(without.status.code(), Some(2), "{without:?}");
 }
 
-/// The gateway with a state directory that outlives it, and the broker beside it.
-struct Gateway {
-    child: Child,
-    http: u16,
-    log: PathBuf,
+/// A configuration in which the relays have these settings.
+fn declared(broker: &Broker, port: &TcpPort, settings: &str) -> String {
+    format!(
+        "mqtt: {{url: '{}'}}\nbuses: {{line: {{tcp: '{}'}}}}\n\
+         devices: {{relays: {{profile: {RELAYS}, bus: line, unit: 18, settings: {settings}}}}}\n",
+        broker.url(),
+        port.address()
+    )
 }
 
-impl Gateway {
-    fn start(broker: &Mosquitto, port: &TcpPort, folder: &Folder, settings: &str) -> Gateway {
-        let http = free_port();
-        let state = folder.0.path().join("state");
-        let config = folder.file(
-            "busker.yaml",
-            &format!(
-                "mqtt: {{url: {}}}\nhttp: {{listen: '127.0.0.1:{http}'}}\nstate_dir: {}\n\
-                 buses: {{line: {{tcp: '{}'}}}}\n\
-                 devices: {{relays: {{profile: {RELAYS}, bus: line, unit: 18, settings: {settings}}}}}\n",
-                broker.url(),
-                state.display(),
-                port.address()
-            ),
-        );
-        let log = folder.0.path().join("log");
-        let child = Command::new(program())
-            .args(["run", "--config", &config])
-            .stdin(Stdio::null())
-            .stderr(File::create(&log).expect("a log"))
-            .spawn()
-            .expect("the program is built");
-        Gateway { child, http, log }
-    }
-
-    fn stop(mut self) {
-        let _ = kill_process(Pid::from_child(&self.child), Signal::TERM);
-        wait_for("the end of the gateway", || self.child.try_wait().expect("a child can be asked"));
-    }
-
-    fn log(&self) -> String {
-        fs::read_to_string(&self.log).unwrap_or_default()
-    }
-
-    /// How often the EEPROM was written, as the metrics tell it.
-    fn persistent_writes(&self) -> String {
-        let url = format!("http://127.0.0.1:{}/metrics", self.http);
-        let line = "busker_device_persistent_writes_total{bus=\"line\",device=\"relays\"} ";
-        wait_for("the metrics", || {
-            let text = ureq::get(&url).call().ok()?.body_mut().read_to_string().ok()?;
-            text.lines().find_map(|found| found.strip_prefix(line)).map(str::to_string)
-        })
-    }
-}
-
-impl Drop for Gateway {
-    fn drop(&mut self) {
-        // It may have ended by itself.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+/// How often the EEPROM was written, as the metrics tell it.
+fn persistent_writes(gateway: &Gateway) -> String {
+    let line = "busker_device_persistent_writes_total{bus=\"line\",device=\"relays\"} ";
+    wait_for("the metrics", || {
+        gateway.get("/metrics").1.lines().find_map(|found| found.strip_prefix(line)).map(str::to_string)
+    })
 }
 
 /// Waits for a device's info, after the first `from` messages, in which the drift is this.
-fn wait_for_drift(observer: &Observer, from: usize, drift: &str) {
+fn wait_for_drift(watcher: &Watcher, from: usize, drift: &str) {
     let wanted: serde_json::Value = serde_json::from_str(drift).expect("JSON");
     wait_for(drift, || {
-        let seen = observer.seen();
+        let seen = watcher.received();
         let mut infos = seen.iter().skip(from).filter(|seen| seen.topic == "busker/relays/info");
         infos.find(|seen| {
             let info: serde_json::Value = serde_json::from_str(&seen.payload).expect("JSON");
@@ -282,46 +239,47 @@ fn wait_for_drift(observer: &Observer, from: usize, drift: &str) {
 
 #[test]
 fn a_declared_setting_is_written_once_and_a_restart_writes_nothing() {
-    let (broker, folder) = (Mosquitto::start(), Folder::new());
+    let broker = Broker::start();
     let (_simulation, port) = fresh(RELAYS, 18);
-    let observer = Observer::of(&broker);
-    let state = folder.0.path().join("state/devices/relays.json");
+    let watcher = Watcher::start(&broker, "watcher");
+    let with = |settings: &str| declared(&broker, &port, settings);
 
-    let gateway = Gateway::start(&broker, &port, &folder, "{watchdog: 30s}");
-    observer.wait_for("busker/relays/watchdog", "30.00");
+    let gateway = Gateway::start_with(&with("{watchdog: 30s}"));
+    let state = gateway.state().join("devices/relays.json");
+    watcher.shows("busker/relays/watchdog", "30.00");
     // What has been done is known soon, however the gateway ends.
     wait_for("the state file", || read(&state).filter(|text| text.contains("\"watchdog\": \"done\"")));
-    drop(gateway);
 
     // Somebody sets it otherwise; the gateway finds it so, tells it and leaves it.
-    let written = by_hand(&["write", "watchdog", "60"], &port, RELAYS, 18);
-    assert!(written.status.success(), "{written:?}");
-    let from = observer.count();
-    let gateway = Gateway::start(&broker, &port, &folder, "{watchdog: 30s}");
-    wait_for_drift(&observer, from, r#"[{"point":"watchdog","wanted":"30s","found":"60.00","reason":null}]"#);
-    assert!(gateway.log().contains("device relays: watchdog holds 60.00, and its settings want 30s"));
-    assert_eq!(gateway.persistent_writes(), "1", "that of the first run");
-    gateway.stop();
+    let mut from = 0;
+    let meanwhile = || {
+        let written = by_hand(&["write", "watchdog", "60"], &port, RELAYS, 18);
+        assert!(written.status.success(), "{written:?}");
+        from = watcher.count();
+    };
+    let gateway = gateway.kill_and_start_again(meanwhile, &with("{watchdog: 30s}"));
+    wait_for_drift(&watcher, from, r#"[{"point":"watchdog","wanted":"30s","found":"60.00","reason":null}]"#);
+    gateway.wait_for_log("device relays: watchdog holds 60.00, and its settings want 30s");
+    assert_eq!(persistent_writes(&gateway), "1", "that of the first run");
 
     // The section changes, and every difference is written once.
-    let gateway = Gateway::start(&broker, &port, &folder, "{watchdog: 30s, relay_1_default: ON}");
-    observer.wait_for("busker/relays/relay_1_default", "ON");
-    observer.wait_for("busker/relays/watchdog", "30.00");
-    assert_eq!(gateway.persistent_writes(), "3");
-    gateway.stop();
+    let gateway = gateway.start_again(|| {}, &with("{watchdog: 30s, relay_1_default: ON}"));
+    watcher.shows("busker/relays/relay_1_default", "ON");
+    watcher.shows("busker/relays/watchdog", "30.00");
+    assert_eq!(persistent_writes(&gateway), "3");
 
     // A damaged file is kept, and the gateway runs.
-    fs::write(&state, "{\"version\": 1,").expect("a damaged file");
-    let from = observer.count();
-    let gateway = Gateway::start(&broker, &port, &folder, "{watchdog: 30s, relay_1_default: ON}");
-    wait_for_drift(&observer, from, "[]");
-    let log = gateway.log();
-    assert!(log.contains("relays.json` cannot be used (EOF while parsing"), "{log}");
-    assert!(log.contains("relays.json.broken`"), "{log}");
-    assert_eq!(gateway.persistent_writes(), "0");
-    gateway.stop();
+    let meanwhile = || {
+        fs::write(&state, "{\"version\": 1,").expect("a damaged file");
+        from = watcher.count();
+    };
+    let gateway = gateway.start_again(meanwhile, &with("{watchdog: 30s, relay_1_default: ON}"));
+    wait_for_drift(&watcher, from, "[]");
+    gateway.wait_for_log("relays.json` cannot be used (EOF while parsing");
+    gateway.wait_for_log("relays.json.broken`");
+    assert_eq!(persistent_writes(&gateway), "0");
     assert_eq!(read(&state.with_extension("json.broken")).as_deref(), Some("{\"version\": 1,"));
-    assert!(read(&state).is_some_and(|text| text.contains("\"watchdog\": \"unchanged\"")));
+    wait_for("the state file", || read(&state).filter(|text| text.contains("\"watchdog\": \"unchanged\"")));
 }
 
 fn read(path: &Path) -> Option<String> {

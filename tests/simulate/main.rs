@@ -1,9 +1,8 @@
 //! `busker simulate` as a person uses it: arguments, commands on its standard input, and its end; and
 //! the simulated devices against the profiles.
 
-#[expect(dead_code, reason = "some of it is for tests/strangers")]
-#[path = "../strangers/broker.rs"]
-mod broker;
+#[path = "../support/mod.rs"]
+mod support;
 mod two_readings;
 
 use std::io::{BufRead, BufReader, Read, Write};

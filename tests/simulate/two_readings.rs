@@ -2,33 +2,28 @@
 //! reads every point of every simulated device and writes every setting, and the two must agree.
 
 use std::path::Path;
-use std::process::{Child, Command};
+use std::process::Command;
 use std::time::Duration;
 
 use busker::engine::value::Decimal;
 use busker::simulator::{DeviceAt, Model, Options, Simulation};
-use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-use crate::broker::{Broker, Listener};
+use crate::support::{Broker, Gateway, Watcher};
 
 /// The first device's unit; each further one has the next.
 const FIRST_UNIT: u8 = 1;
 
 #[test]
 fn the_gateway_reads_every_point_and_writes_every_setting_of_the_simulated_devices() {
-    let directory = tempfile::tempdir().expect("a directory");
     let devices: Vec<DeviceAt> =
         Model::ALL.into_iter().zip(FIRST_UNIT..).map(|(model, unit)| DeviceAt { model, unit }).collect();
     let options = Options { turnaround: Duration::ZERO, ..Options::default() };
     let simulation = Simulation::new(&devices, options).expect("a simulation");
     let line = simulation.serve_pty(None).expect("a pseudo-terminal");
-    let broker = Broker::start(directory.path());
-    let mut listener = broker.listen();
-    let configuration = directory.path().join("busker.yaml");
-    std::fs::write(&configuration, configuration_text(&devices, &broker, directory.path(), line.path()))
-        .expect("written");
-    let mut gateway = Gateway::start(&configuration);
+    let broker = Broker::start();
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start(&broker, &configuration(&devices, line.path()));
 
     let (mut read, mut written) = (0, 0);
     let mut disagreements = Vec::new();
@@ -36,17 +31,17 @@ fn the_gateway_reads_every_point_and_writes_every_setting_of_the_simulated_devic
         let points = points(device.model.id());
         let device = name_of(device);
         for point in &points {
-            bring_to_life(&mut listener, &device, &points, point);
+            bring_to_life(&watcher, &device, &points, point);
             // What is read on request only has a test of its own.
             if point["access"].as_str().is_some_and(|access| access.contains('r'))
                 && point["poll"] != "never"
                 && point["event"].is_null()
             {
-                listener.wait(&topic(&device, point), |payload| payload != "None");
+                watcher.shows_what(&topic(&device, point), "a value", |payload| payload != "None");
                 read += 1;
             }
             if let Some(value) = value_to_write(point) {
-                let outcome = write(&mut listener, &topic(&device, point), &value);
+                let outcome = write(&watcher, &topic(&device, point), &value);
                 written += 1;
                 if !is_taken(&outcome) && !is_rightly_not_taken(&topic(&device, point), &outcome) {
                     disagreements.push(format!("{}: {value}: {outcome}", topic(&device, point)));
@@ -56,9 +51,9 @@ fn the_gateway_reads_every_point_and_writes_every_setting_of_the_simulated_devic
     }
     // A fault has stopped the recording of the first voltage; the curve comes when somebody asks for it.
     let curve = "busker/metz_connect_mr_sm3/phase_1_waveform";
-    listener.wait("busker/metz_connect_mr_sm3/recording", |payload| payload == "stopped");
-    listener.publish(&format!("{curve}/get"), "");
-    listener.wait(curve, |payload| {
+    watcher.shows("busker/metz_connect_mr_sm3/recording", "stopped");
+    watcher.publish(&format!("{curve}/get"), "");
+    watcher.shows_what(curve, "a curve of 128 samples", |payload| {
         serde_json::from_str::<Vec<f64>>(payload).is_ok_and(|samples| samples.len() == 128)
     });
 
@@ -66,34 +61,32 @@ fn the_gateway_reads_every_point_and_writes_every_setting_of_the_simulated_devic
     assert!(disagreements.is_empty(), "{}", disagreements.join("\n"));
     // A test that finds no points would find no disagreement either.
     assert!(read > 700 && written > 500, "{read} read, {written} written");
-    gateway.end();
+    assert!(gateway.terminate().success());
 }
 
 /// Sets what decides whether the point lives.
-fn bring_to_life(listener: &mut Listener, device: &str, points: &[Value], point: &Value) {
+fn bring_to_life(watcher: &Watcher, device: &str, points: &[Value], point: &Value) {
     for (selector, names) in point["when"].as_object().into_iter().flatten() {
         let selector = points.iter().find(|other| other["name"] == *selector.as_str()).expect("a point");
         let is_enough =
             |says: &str| names.as_array().is_some_and(|names| names.iter().any(|name| name == says));
-        if listener.says(&topic(device, selector)).is_some_and(is_enough) {
+        if watcher.last(&topic(device, selector)).as_deref().is_some_and(is_enough) {
             continue;
         }
         let name = names[0].as_str().expect("a name");
         if selector["access"] == "rw" {
-            let outcome = write(listener, &topic(device, selector), name);
+            let outcome = write(watcher, &topic(device, selector), name);
             assert!(is_taken(&outcome), "{}: {name}: {outcome}", topic(device, selector));
         }
-        listener.wait(&topic(device, selector), |payload| payload == name);
+        watcher.shows(&topic(device, selector), name);
     }
 }
 
 /// How a command ended.
-fn write(listener: &mut Listener, topic: &str, value: &str) -> String {
-    let outcome = format!("{topic}/outcome");
-    listener.forget(&outcome);
-    listener.publish(&format!("{topic}/set"), value);
-    listener.wait(&outcome, |_| true);
-    listener.says(&outcome).unwrap_or_default().to_string()
+fn write(watcher: &Watcher, topic: &str, value: &str) -> String {
+    let from = watcher.count();
+    watcher.publish(&format!("{topic}/set"), value);
+    watcher.wait_for_next(&format!("{topic}/outcome"), from)
 }
 
 fn is_taken(outcome: &str) -> bool {
@@ -170,48 +163,18 @@ fn points(profile: &str) -> Vec<Value> {
     shown["points"].as_array().expect("a list").clone()
 }
 
-fn configuration_text(devices: &[DeviceAt], broker: &Broker, directory: &Path, line: &Path) -> String {
+fn configuration(devices: &[DeviceAt], line: &Path) -> String {
     let entry = |device: &DeviceAt| {
         let (name, profile, unit) = (name_of(device), device.model.id(), device.unit);
         format!("  {name}: {{profile: {profile}, bus: line, unit: {unit}}}\n")
     };
     let devices: String = devices.iter().map(entry).collect();
     format!(
-        "mqtt: {{url: mqtt://127.0.0.1:{}}}
-http: {{listen: null}}
-state_dir: {}
-eeprom: {{interval: 0s, daily: 65535}}
+        "eeprom: {{interval: 0s, daily: 65535}}
 buses:
   line: {{serial: {}, baud: 19200, parity: even, response_timeout: 10s}}
 devices:
 {devices}",
-        broker.port(),
-        directory.join("state").display(),
         line.display()
     )
-}
-
-/// `busker run`; it is killed if the test fails.
-struct Gateway {
-    child: Child,
-}
-
-impl Gateway {
-    fn start(configuration: &Path) -> Gateway {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_busker"));
-        let child = command.arg("run").arg("--config").arg(configuration).spawn();
-        Gateway { child: child.expect("the gateway starts") }
-    }
-
-    fn end(&mut self) {
-        kill_process(Pid::from_child(&self.child), Signal::TERM).expect("signalled");
-        assert_eq!(self.child.wait().expect("a child").code(), Some(0));
-    }
-}
-
-impl Drop for Gateway {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
 }

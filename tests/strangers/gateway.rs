@@ -6,10 +6,8 @@ use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-use rustix::process::{Pid, Signal, kill_process};
-
-use crate::broker::Broker;
 use crate::peers;
+use crate::support::{Broker, Gateway, Watcher};
 
 const ORDERS: [&str; 4] = ["abcd", "cdab", "badc", "dcba"];
 
@@ -105,38 +103,31 @@ fn the_gateway_reads_and_writes_all_types_and_orders_of_a_pymodbus_server_over_a
 
 fn check(kind: &str, bus: impl Fn(&str) -> String) {
     let Some(python) = peers::pymodbus() else { return };
-    let directory = tempfile::tempdir().expect("a directory");
     let mut server = Server::start(&python, kind);
-    let broker = Broker::start(directory.path());
-    let configuration = directory.path().join("busker.yaml");
-    let text = configuration_text(broker.port(), directory.path(), &bus(&server.place));
-    std::fs::write(&configuration, text).expect("written");
-    let mut listener = broker.listen();
-    let mut gateway = Gateway::start(&configuration);
+    let broker = Broker::start();
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start(&broker, &configuration(&bus(&server.place)));
 
     let points = || ORDERS.iter().flat_map(|order| TYPES.iter().map(move |each| (*order, each)));
     for (order, each) in points() {
         for table in ["holding", "input"] {
             let topic = format!("busker/stranger/{table}_{order}_{}", each.name);
-            listener.wait(&topic, |payload| payload == each.at_first);
+            watcher.shows(&topic, each.at_first);
         }
     }
     for bit in 0..16 {
         let state = if bit % 3 == 0 { "ON" } else { "OFF" };
         for table in ["coil", "discrete"] {
-            listener.wait(&format!("busker/stranger/{table}_{}", bit + 1), |payload| payload == state);
+            watcher.shows(&format!("busker/stranger/{table}_{}", bit + 1), state);
         }
     }
 
     for (order, each) in points() {
         let topic = format!("busker/stranger/holding_{order}_{}", each.name);
-        listener.publish(&format!("{topic}/set"), each.written);
-        listener.wait(&format!("{topic}/outcome"), |_| true);
-        listener.check(&format!("{topic}/outcome"), |payload| payload.contains("\"done\""));
-        listener.wait(&topic, |payload| payload == each.written);
+        assert_eq!(write(&watcher, &topic, each.written), "done", "{topic}");
+        watcher.shows(&topic, each.written);
     }
-    listener.publish("busker/stranger/coil_2/set", "ON");
-    listener.wait("busker/stranger/coil_2/outcome", |payload| payload.contains("\"done\""));
+    assert_eq!(write(&watcher, "busker/stranger/coil_2", "ON"), "done");
 
     // What the server itself found in its registers is the proof; the gateway might agree with itself.
     let held = server.held();
@@ -144,11 +135,20 @@ fn check(kind: &str, bus: impl Fn(&str) -> String) {
         assert_eq!(held[format!("{order}_{}", each.name)], each.written, "{order} {}", each.name);
     }
     assert_eq!(held["coils"], "1101001001001001");
-    gateway.end();
-    listener.wait("busker/bridge/state", |payload| payload == "offline");
+    assert!(gateway.terminate().success());
+    watcher.shows("busker/bridge/state", "offline");
 }
 
-fn configuration_text(broker: u16, directory: &Path, bus: &str) -> String {
+/// How a command ended.
+fn write(watcher: &Watcher, topic: &str, value: &str) -> String {
+    let from = watcher.count();
+    watcher.publish(&format!("{topic}/set"), value);
+    let outcome = watcher.wait_for_next(&format!("{topic}/outcome"), from);
+    let outcome: serde_json::Value = serde_json::from_str(&outcome).expect("JSON");
+    outcome["outcome"].as_str().expect("a word").to_owned()
+}
+
+fn configuration(bus: &str) -> String {
     let mut points = String::new();
     for (number, order) in ORDERS.iter().enumerate() {
         for Type { name, kind, register, write, .. } in &TYPES {
@@ -162,10 +162,7 @@ fn configuration_text(broker: u16, directory: &Path, bus: &str) -> String {
         }
     }
     format!(
-        "mqtt: {{url: mqtt://127.0.0.1:{broker}}}
-http: {{listen: null}}
-state_dir: {}
-buses:
+        "buses:
   line: {bus}
 devices:
   stranger:
@@ -174,8 +171,7 @@ devices:
     points:
       coil: {{for: 1..16, at: coil 0, poll: fast, write: any}}
       discrete: {{for: 1..16, at: discrete 0, poll: fast}}
-{points}",
-        directory.join("state").display()
+{points}"
     )
 }
 
@@ -219,35 +215,6 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         drop(self.questions.take());
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-/// `busker run`; it is killed if the test fails.
-struct Gateway {
-    child: Child,
-}
-
-impl Gateway {
-    fn start(configuration: &Path) -> Gateway {
-        let child = Command::new(env!("CARGO_BIN_EXE_busker"))
-            .arg("run")
-            .arg("--config")
-            .arg(configuration)
-            .spawn()
-            .expect("the gateway starts");
-        Gateway { child }
-    }
-
-    fn end(&mut self) {
-        kill_process(Pid::from_child(&self.child), Signal::TERM).expect("signalled");
-        assert_eq!(self.child.wait().expect("a child").code(), Some(0));
-    }
-}
-
-impl Drop for Gateway {
-    fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -4,8 +4,8 @@
 //! pymodbus comes from the Python package index and mbpoll (with libmodbus) from Debian, each once,
 //! into `.peers/`. Where one cannot be had, its test says so and passes, unless `CI=true` is set.
 
-#[expect(dead_code, reason = "some of it is for tests/simulate")]
-mod broker;
 mod gateway;
 mod peers;
 mod simulator;
+#[path = "../support/mod.rs"]
+mod support;
