@@ -147,7 +147,15 @@ impl Guard {
             return None;
         }
         let whole = HEADER - 1 + length;
-        if self.heard.len() < whole { None } else { Some(self.heard.drain(..whole).collect()) }
+        if self.heard.len() < whole {
+            return None;
+        }
+        if !may_begin_a_frame(&self.heard[whole..]) {
+            self.broken = Some("a frame is not as long as its header says");
+            self.heard.clear();
+            return None;
+        }
+        Some(self.heard.drain(..whole).collect())
     }
 
     fn frame_came(&mut self, now: Time, frame: &[u8]) -> Option<Reply> {
@@ -176,6 +184,14 @@ impl Guard {
         self.state = State::Idle;
         Some(Reply::new(result, sent_at, Some((first_byte_at, now)), &mut self.discarded))
     }
+}
+
+/// Whether these bytes, which came behind a frame, can be the beginning of another. If not, the frame was
+/// shorter than its header says, and the other's first bytes have been taken for its last ones: on a
+/// stream without checksums that would become a value.
+fn may_begin_a_frame(bytes: &[u8]) -> bool {
+    let protocol = bytes.iter().skip(2).take(2);
+    protocol.copied().all(|byte| byte == 0)
 }
 
 #[cfg(test)]
@@ -262,6 +278,22 @@ mod tests {
             assert_eq!(reply.result, Ok(Answer::Words(vec![1, 2])));
             assert_eq!(reply.discarded, Discarded { late_replies: 1, ..Default::default() });
         }
+    }
+
+    #[test]
+    fn the_beginning_of_another_frame_does_not_complete_one_that_is_too_short() {
+        let short = &frame(1, 1, &GOOD)[..11];
+        let late = frame(484, 3, &GOOD);
+        for pieces in [vec![[short, &late].concat()], vec![short.to_vec(), late.clone()]] {
+            let mut guard = asked();
+            let reply = pieces.iter().find_map(|piece| guard.received(Time(5), piece));
+            let reason = "a frame is not as long as its header says";
+            assert_eq!(reply.expect("it is noticed").result, Err(RequestError::Link(reason.into())));
+        }
+        // Where the other one comes whole, nothing is wrong.
+        let mut guard = asked();
+        let reply = guard.received(Time(5), &[frame(1, 1, &GOOD), late].concat());
+        assert_eq!(reply.expect("the answer").result, Ok(Answer::Words(vec![1, 2])));
     }
 
     #[test]
