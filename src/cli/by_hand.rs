@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 
+use super::characters::Characters;
 use super::{Failure, configuration};
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
@@ -16,7 +17,7 @@ use crate::engine::identity;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
 use crate::engine::profile::Library;
-use crate::engine::settings::{self, Line, Parity, Rs485};
+use crate::engine::settings::{self, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::{Scalar, nearest};
 
@@ -35,15 +36,8 @@ pub struct ByHand {
     /// The device's unit on the line; 0 writes to all units of an RTU line
     #[arg(long, value_name = "UNIT", conflicts_with = "config")]
     unit: Option<u8>,
-    /// The line's bit rate
-    #[arg(long, value_name = "RATE", default_value_t = 19200, value_parser = clap::value_parser!(u32).range(300..=1_000_000), conflicts_with = "config")]
-    baud: u32,
-    /// The line's parity: even, odd or none
-    #[arg(long, default_value = "even", value_parser = parity, conflicts_with = "config")]
-    parity: Parity,
-    /// The line's stop bits: 1 or 2
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=2), conflicts_with = "config")]
-    stop_bits: u8,
+    #[command(flatten)]
+    characters: Characters,
     /// How long a reply may take
     #[arg(long, value_name = "TIME", default_value = "500ms", value_parser = <Duration as Scalar>::parse, conflicts_with = "config")]
     timeout: Duration,
@@ -66,15 +60,6 @@ struct WhichLine {
     config: Option<PathBuf>,
 }
 
-pub fn parity(name: &str) -> Result<Parity, String> {
-    match name {
-        "none" => Ok(Parity::None),
-        "even" => Ok(Parity::Even),
-        "odd" => Ok(Parity::Odd),
-        _ => Err("expected even, odd or none".into()),
-    }
-}
-
 /// A device that can be asked.
 pub struct Asked {
     link: GuardedLink,
@@ -92,7 +77,7 @@ type Answered = Result<Answer, RequestError>;
 impl ByHand {
     /// Opens the line.
     pub fn open(&self) -> Result<Asked, Failure> {
-        let line = Line { baud: self.baud, parity: self.parity, stop_bits: self.stop_bits };
+        let line = self.characters.line();
         let link = match (&self.line.serial, &self.line.tcp, &self.line.rtu_over_tcp) {
             (Some(path), ..) => settings::Link::Serial { path: path.clone(), line, rs485: Rs485::Auto },
             (_, Some(address), _) => {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::by_hand::parity;
+use super::characters::Characters;
 use super::configuration::ConfigurationArgs;
 use super::{Failure, output};
 use crate::edge::clock::Clock;
@@ -12,7 +12,7 @@ use crate::edge::link::check_up::{self, CheckUp, Opened};
 use crate::edge::link::{Link, Lost};
 use crate::engine::modbus::rtu_bytes::{frame, sort};
 use crate::engine::modbus::{Call, names::QUERY, pdu};
-use crate::engine::settings::{self, Direction, Line, Parity, Rs485};
+use crate::engine::settings::{self, Direction, Line, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::Scalar;
 
@@ -29,15 +29,8 @@ use crate::engine::yaml::Scalar;
 pub struct Args {
     #[command(flatten)]
     which: Which,
-    /// The line's bit rate
-    #[arg(long, value_name = "RATE", default_value_t = 19200, value_parser = clap::value_parser!(u32).range(300..=1_000_000), conflicts_with = "config")]
-    baud: u32,
-    /// The line's parity: even, odd or none
-    #[arg(long, default_value = "even", value_parser = parity, conflicts_with = "config")]
-    parity: Parity,
-    /// The line's stop bits: 1 or 2
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=2), conflicts_with = "config")]
-    stop_bits: u8,
+    #[command(flatten)]
+    characters: Characters,
     /// How long to listen on each line
     #[arg(long, value_name = "TIME", default_value = "2s", value_parser = <Duration as Scalar>::parse)]
     listen: Duration,
@@ -140,7 +133,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
 impl Args {
     fn patients(&self) -> Result<Vec<Patient>, Failure> {
         if let Some(path) = &self.which.serial {
-            let line = Line { baud: self.baud, parity: self.parity, stop_bits: self.stop_bits };
+            let line = self.characters.line();
             return Ok(vec![Patient::new(None, path, line, Rs485::Auto)]);
         }
         let config = self.which.config.clone().unwrap_or_default();

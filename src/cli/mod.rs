@@ -12,6 +12,7 @@
 //! `main.rs` prints it and chooses the exit code.
 
 mod by_hand;
+mod characters;
 mod check;
 pub mod configuration;
 mod demo;

@@ -6,8 +6,8 @@ use busker::engine::device::{
 };
 use busker::engine::profile::Library;
 use busker::engine::settings::{
-    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Layout, Line, Link, Manner, Mqtt, OnBrokerLoss, Parity,
-    Password, Recorder, Rs485, Settings, Wanted,
+    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Line, Link, Mqtt, OnBrokerLoss, Parity, Password,
+    Recorder, Rs485, Settings, Wanted,
 };
 use busker::engine::time::Duration;
 use busker::engine::units::Release;
@@ -49,19 +49,7 @@ pub fn settings(header: &str) -> Settings {
     }
     let says = |wanted: &str| header.lines().any(|line| line == wanted);
     Settings {
-        mqtt: Mqtt {
-            host: "localhost".into(),
-            port: 1883,
-            websocket: None,
-            tls: None,
-            keep_alive: Duration::from_secs(15),
-            username: None,
-            password: Password::None,
-            base_topic: "busker".into(),
-            topics: Layout::default(),
-            values: Manner::default(),
-            json: says("json"),
-        },
+        mqtt: Mqtt { json: says("json"), ..Mqtt::default() },
         home_assistant: HomeAssistant {
             discovery: says("discovery"),
             prefix: "homeassistant".into(),

@@ -14,7 +14,7 @@ use super::output::{self, Table};
 use super::{Failure, configuration};
 use crate::engine::device::{Condition, Device, Encoding, Point, PointIndex, Poll, Unit, WriteRule};
 use crate::engine::profile::{self, Library};
-use crate::engine::yaml::list_of_choices;
+use crate::engine::yaml::{Diagnostic, list_of_choices};
 
 /// List, show, check and document device profiles
 #[derive(Debug, clap::Args)]
@@ -74,15 +74,20 @@ pub fn run(args: Args) -> Result<(), Failure> {
     }
 }
 
-fn list(library: &Library, json: bool) -> Result<(), Failure> {
-    let mut devices = Vec::new();
-    let mut faults = Vec::new();
+/// Every profile, and what is wrong with those that cannot be used.
+fn load_all(library: &Library) -> (Vec<Device>, Vec<Diagnostic>) {
+    let (mut devices, mut faults) = (Vec::new(), Vec::new());
     for id in library.ids() {
         match library.load(id) {
             Ok(device) => devices.push(device),
             Err(found) => faults.extend(found),
         }
     }
+    (devices, faults)
+}
+
+fn list(library: &Library, json: bool) -> Result<(), Failure> {
+    let (devices, faults) = load_all(library);
     if json {
         output::print_json(&devices.iter().map(json::summary).collect::<Vec<_>>())?;
     } else {

@@ -153,7 +153,6 @@ mod tests {
     use rumqttc::{AsyncClient, MqttOptions, QoS, StateError};
 
     use super::*;
-    use crate::engine::settings::{Layout, Manner, Password};
 
     /// The library keeps such a message, and would hand it out after the next connect.
     #[test]
@@ -165,19 +164,7 @@ mod tests {
             let command = Packet::Publish(command);
             event_loop.state.events.push_back(rumqttc::Event::Incoming(command.clone()));
             let (seen, mut events) = mpsc::channel(10);
-            let mqtt = Mqtt {
-                host: "localhost".into(),
-                port: 1883,
-                websocket: None,
-                tls: None,
-                keep_alive: Duration::from_secs(15),
-                username: None,
-                password: Password::None,
-                base_topic: "busker".into(),
-                topics: Layout::default(),
-                values: Manner::default(),
-                json: false,
-            };
+            let mqtt = Mqtt::default();
             let mut poller = Poller {
                 event_loop,
                 seen,

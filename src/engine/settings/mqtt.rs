@@ -29,6 +29,25 @@ pub struct Mqtt {
     pub json: bool,
 }
 
+impl Default for Mqtt {
+    /// A broker on this machine that lets everybody in.
+    fn default() -> Mqtt {
+        Mqtt {
+            host: "localhost".into(),
+            port: 1883,
+            websocket: None,
+            tls: None,
+            keep_alive: Duration::from_secs(15),
+            username: None,
+            password: Password::None,
+            base_topic: "busker".into(),
+            topics: Layout::default(),
+            values: Manner::default(),
+            json: false,
+        }
+    }
+}
+
 impl fmt::Debug for Mqtt {
     /// Tells everything but the password.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -52,14 +52,7 @@ fn write(place: &Path, text: &str) -> std::io::Result<()> {
 
 /// Every file by its path below the folder.
 fn files(library: &Library) -> Result<Vec<(String, String)>, Failure> {
-    let mut devices = Vec::new();
-    let mut faults = Vec::new();
-    for id in library.ids() {
-        match library.load(id) {
-            Ok(device) => devices.push(device),
-            Err(found) => faults.extend(found),
-        }
-    }
+    let (devices, faults) = super::load_all(library);
     if !faults.is_empty() {
         return Err(configuration::faults(faults).so("nothing was written"));
     }
