@@ -1,4 +1,4 @@
-//! The status page: one file, which needs nothing but `/api/events`.
+//! The status page: one answer, which needs nothing but `/api/events`.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -6,9 +6,19 @@ use std::io::{self, Read};
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
-const PAGE: &str = include_str!("page.html");
+const FRAME: &str = include_str!("page/frame.html");
+const STYLE: &str = include_str!("page/style.css");
+/// One script; what is outside functions is done in this order.
+const SCRIPT: &str = concat!(
+    include_str!("page/state.js"),
+    include_str!("page/elements.js"),
+    include_str!("page/buses.js"),
+    include_str!("page/points.js"),
+    include_str!("page/devices.js"),
+    include_str!("page/stream.js"),
+);
 
-/// Stands in the file where the nonce goes.
+/// Stands in the frame where the nonce goes.
 const NONCE: &str = "{nonce}";
 
 pub async fn page() -> Response {
@@ -18,12 +28,16 @@ pub async fn page() -> Response {
                 (header::CONTENT_TYPE, "text/html; charset=utf-8".to_string()),
                 (header::CONTENT_SECURITY_POLICY, policy(&nonce)),
             ];
-            (headers, PAGE.replace(NONCE, &nonce)).into_response()
+            (headers, whole(&nonce)).into_response()
         }
         Err(error) => {
             (StatusCode::INTERNAL_SERVER_ERROR, format!("no random numbers: {error}\n")).into_response()
         }
     }
+}
+
+fn whole(nonce: &str) -> String {
+    FRAME.replace(NONCE, nonce).replace("{style}", STYLE).replace("{script}", SCRIPT)
 }
 
 /// The page's own style and script and nobody else's, which talk to this gateway and nobody else.
@@ -47,15 +61,19 @@ mod tests {
 
     #[test]
     fn the_page_brings_all_it_needs() {
-        assert_eq!(PAGE.matches(NONCE).count(), 2, "one style and one script");
-        assert_eq!(PAGE.matches("<style").count() + PAGE.matches("<script").count(), 2);
+        let page = whole("0123");
+        assert_eq!(page.matches("nonce=\"0123\"").count(), 2, "one style and one script");
+        assert_eq!(page.matches("<style").count() + page.matches("<script").count(), 2);
         // An address would be something to load; the one there is names the language of drawings.
         let namespace = "http://www.w3.org/2000/svg";
-        assert!(!PAGE.replace(namespace, "").contains("://"));
+        assert!(!page.replace(namespace, "").contains("://"));
         for forbidden in
             ["<link", "<img", "src=", "@import", "url(", "innerHTML", "eval(", "style=\"", "onclick"]
         {
-            assert!(!PAGE.contains(forbidden), "`{forbidden}` needs more than the policy allows");
+            assert!(!page.contains(forbidden), "`{forbidden}` needs more than the policy allows");
+        }
+        for left in [NONCE, "{style}", "{script}"] {
+            assert!(!page.contains(left), "`{left}` is left in it");
         }
     }
 
