@@ -153,12 +153,18 @@ pub const USUAL_TURNAROUND: Duration = Duration::from_millis(5);
 pub fn plan(device: &Device, cost: Cost, refused: &[Span]) -> Vec<Read> {
     let mut places: Vec<Address> = device.points.iter().map(|point| point.at).collect();
     let mut best = plan_at(device, &places, cost, refused);
-    // The same value may stand in two places (relay states as coils and as bits of a register). All
-    // points that have the same two tables move together: half of them elsewhere gains nothing.
-    for moved in groups_with_a_second_place(device) {
+    // The same value may stand in two places (relay states as coils and as bits of a register). Most often
+    // all points that have the same two tables are best moved together; then each that lies apart from the
+    // others by itself.
+    let mut together = groups_with_a_second_place(device);
+    let each: Vec<Vec<PointIndex>> = together.iter().flatten().map(|point| vec![*point]).collect();
+    together.extend(each);
+    for moved in together {
         let mut elsewhere = places.clone();
-        for point in moved {
-            elsewhere[point] = device.points[point].also.unwrap_or(places[point]);
+        for index in moved {
+            let point = &device.points[index];
+            let Some(also) = point.also else { continue };
+            elsewhere[index] = if places[index] == also { point.at } else { also };
         }
         let candidate = plan_at(device, &elsewhere, cost, refused);
         if total(&candidate, cost) < total(&best, cost) {
@@ -222,6 +228,9 @@ fn together_by_span(poll: Poll, points: Vec<(PointIndex, Address)>, alone: bool)
 
 /// The cheapest partition of sorted points of one table: `cheapest[end]` is the cost of reading the
 /// first `end` points, and where the last of those reads begins.
+///
+/// A read only grows from point to point, and what forbids it forbids each longer one: so each beginning
+/// looks no further than that, and a device with thousands of points is planned in no time.
 fn cut(
     device: &Device,
     poll: Poll,
@@ -229,26 +238,26 @@ fn cut(
     cost: Cost,
     refused: &[Span],
 ) -> Vec<Read> {
-    let mut cheapest: Vec<(u64, usize)> = vec![(0, 0)];
-    for end in 1..=points.len() {
-        let mut best = (u64::MAX, end - 1);
-        for begin in (0..end).rev() {
-            let read = read_of(poll, &points[begin..end]);
-            if begin + 1 < end && !may_be_one_read(device, &read, refused) {
-                if read.span.count() > limit(device, read.span) {
-                    // Going further back only widens the read. (A gap, however, may vanish when a wide
-                    // value covers it.)
-                    break;
-                }
-                continue;
+    let Some((_, first)) = points.first() else { return Vec::new() };
+    let rules = Rules::of(device, first.span.table(), refused);
+    let mut cheapest: Vec<(u64, usize)> = vec![(u64::MAX, 0); points.len() + 1];
+    cheapest[0] = (0, 0);
+    for begin in 0..points.len() {
+        let mut span = points[begin].1.span;
+        for end in begin + 1..=points.len() {
+            let next = points[end - 1].1.span;
+            // The points are sorted, so that no later one closes this gap.
+            let gap = u32::from(next.first()).saturating_sub(u32::from(span.last()) + 1);
+            span = span.hull(next).unwrap_or(span);
+            let is_single = end == begin + 1;
+            if !is_single && !rules.allow(span, gap) {
+                break;
             }
-            let before = cheapest[begin].0;
-            let total = before.saturating_add(cost.of_read(read.span));
-            if total < best.0 {
-                best = (total, begin);
+            let total = cheapest[begin].0.saturating_add(cost.of_read(span));
+            if total <= cheapest[end].0 {
+                cheapest[end] = (total, begin);
             }
         }
-        cheapest.push(best);
     }
     let mut reads = Vec::new();
     let mut end = points.len();
@@ -269,22 +278,44 @@ fn read_of(poll: Poll, points: &[(PointIndex, Address)]) -> Read {
     Read { poll, span, points: points.to_vec(), alone: false }
 }
 
-/// Whether several points may travel in one read. (A single one always may: the profile's check has
-/// seen to that.)
-fn may_be_one_read(device: &Device, read: &Read, refused: &[Span]) -> bool {
-    let wire = &device.wire;
-    let gaps = read.gaps();
-    read.span.count() <= limit(device, read.span)
-        && (wire.readable.is_empty() || wire.readable.iter().any(|range| range.contains(read.span)))
-        && !wire.forbidden.iter().any(|forbidden| forbidden.span.overlaps(read.span))
-        && !device.points.iter().any(|point| point.read_clears && point.at.span.overlaps(read.span))
-        && wire.limits.gap.is_none_or(|widest| gaps.iter().all(|gap| gap.count() <= u32::from(widest)))
-        && !refused.iter().any(|span| read.span.contains(*span))
+/// What several points of one table must keep to travel in one read. (A single one always may: the profile's
+/// check has seen to that.)
+struct Rules<'d> {
+    limit: u32,
+    widest_gap: Option<u32>,
+    /// A read lies within one of them, if there are any in the profile.
+    readable: Option<Vec<Span>>,
+    /// No read touches one.
+    untouchable: Vec<Span>,
+    /// No read holds one as a whole.
+    refused: &'d [Span],
 }
 
-fn limit(device: &Device, span: Span) -> u32 {
-    let limits = &device.wire.limits;
-    u32::from(if span.table().is_bits() { limits.read_bits } else { limits.read_registers })
+impl<'d> Rules<'d> {
+    fn of(device: &Device, table: address::Table, refused: &'d [Span]) -> Rules<'d> {
+        let wire = &device.wire;
+        let of_table = |span: &Span| span.table() == table;
+        let forbidden = wire.forbidden.iter().map(|forbidden| forbidden.span);
+        let clearing = device.points.iter().filter(|point| point.read_clears).map(|point| point.at.span);
+        let limits = &wire.limits;
+        Rules {
+            limit: u32::from(if table.is_bits() { limits.read_bits } else { limits.read_registers }),
+            widest_gap: limits.gap.map(u32::from),
+            readable: (!wire.readable.is_empty())
+                .then(|| wire.readable.iter().copied().filter(of_table).collect()),
+            untouchable: forbidden.chain(clearing).filter(of_table).collect(),
+            refused,
+        }
+    }
+
+    /// `gap`: the unused addresses before its last point; those before the others were allowed.
+    fn allow(&self, read: Span, gap: u32) -> bool {
+        read.count() <= self.limit
+            && self.widest_gap.is_none_or(|widest| gap <= widest)
+            && self.readable.as_ref().is_none_or(|ranges| ranges.iter().any(|range| range.contains(read)))
+            && !self.untouchable.iter().any(|span| span.overlaps(read))
+            && !self.refused.iter().any(|span| read.contains(*span))
+    }
 }
 
 /// The plan as a table for people, a line a read.
