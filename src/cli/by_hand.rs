@@ -220,6 +220,10 @@ impl Asked {
                     let result = self.ask(&call)?;
                     flow.answered(device, known, &result)
                 }
+                Step::AskLater(time, call) => {
+                    std::thread::sleep(time);
+                    Step::Ask(call)
+                }
                 Step::Settle(time) => {
                     std::thread::sleep(time);
                     Step::Ask(flow.settled(device))

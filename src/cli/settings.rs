@@ -224,7 +224,7 @@ fn write(
         let outcome = match CommandFlow::begin(device, point, &command, &known) {
             (Some(flow), step) => asked.carry_out(device, flow, step, &known)?,
             (None, Step::Finished(outcome)) => outcome,
-            (None, Step::Ask(_) | Step::Settle(_)) => break,
+            (None, Step::Ask(_) | Step::AskLater(..) | Step::Settle(_)) => break,
         };
         let is_last_word = upkeep.ended(Time::default(), point, &outcome);
         // What the write may have changed is read again before anything else is compared with it.

@@ -117,7 +117,7 @@ fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
     let outcome = match CommandFlow::begin(&device, index, wanted, &known) {
         (Some(flow), step) => asked.carry_out(&device, flow, step, &known)?,
         (None, Step::Finished(outcome)) => return Err(Failure::wrong(outcome.reason.unwrap_or_default())),
-        (None, Step::Ask(_) | Step::Settle(_)) => return Ok(()),
+        (None, Step::Ask(_) | Step::AskLater(..) | Step::Settle(_)) => return Ok(()),
     };
     let mut line = vec![args.place.clone(), outcome.kind.name().to_owned()];
     line.extend(outcome.found.map(|found| format!("the device holds {found}")));

@@ -17,7 +17,18 @@ pub struct CommandFlow {
     point: PointIndex,
     wanted: String,
     state: State,
+    /// The last question, and how often the device was too busy for it.
+    asked: Option<Call>,
+    busy: u32,
 }
+
+/// "Accepted, and it will take long": the exception that says nothing is wrong.
+const ACKNOWLEDGE: u8 = 5;
+/// A device that is busy is asked again after this, and so often.
+const PAUSE_BUSY: Duration = Duration::from_millis(200);
+const BUSY_MAX: u32 = 50;
+/// A button that is pressed late surprises.
+const BUSY_MAX_OF_PRESS: u32 = 15;
 
 #[derive(Clone, Debug, PartialEq)]
 enum State {
@@ -45,6 +56,8 @@ enum Doubt {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Step {
     Ask(Call),
+    /// The same, after so long.
+    AskLater(Duration, Call),
     /// Wait so long, while others may be asked, and go on with [`CommandFlow::settled`].
     Settle(Duration),
     Finished(Outcome),
@@ -128,14 +141,18 @@ impl CommandFlow {
             },
             Err(missing) => return refuse(missing.to_string()),
         };
-        let flow = |state| CommandFlow { point, wanted: wanted.to_string(), state };
+        let flow = |state, call: &Call| {
+            let (wanted, asked) = (wanted.to_string(), Some(call.clone()));
+            CommandFlow { point, wanted, state, asked, busy: 0 }
+        };
         let compares = details.persistent && !is_press(write);
         let reads_before = compares || write.at.bits.is_some() || write.on_change.is_some();
         if !reads_before {
             let call = write_call(write, &field);
-            return (Some(flow(State::Writing { field })), Step::Ask(call));
+            return (Some(flow(State::Writing { field }, &call)), Step::Ask(call));
         }
-        (Some(flow(State::ReadingBefore { field })), Step::Ask(Call::Read(write.at.span)))
+        let call = Call::Read(write.at.span);
+        (Some(flow(State::ReadingBefore { field }, &call)), Step::Ask(call))
     }
 
     pub fn point(&self) -> PointIndex {
@@ -151,7 +168,9 @@ impl CommandFlow {
         if let State::Settling { field, doubt } = &self.state {
             self.state = State::ReadingBack { field: field.clone(), doubt: doubt.clone() };
         }
-        Call::Read(device.points[self.point].at.span)
+        let call = Call::Read(device.points[self.point].at.span);
+        self.asked = Some(call.clone());
+        call
     }
 
     /// Whether the question under way reads the point's place: the answer is news for every point in it.
@@ -175,10 +194,45 @@ impl CommandFlow {
         let Some(write) = &details.write else {
             return self.finish(OutcomeKind::Refused, None, Some("read-only".into()));
         };
+        if let Some(step) = self.ask_busy_again(write, result) {
+            return step;
+        }
+        let step = self.next_step(device, details, write, known, result);
+        if let Step::Ask(call) = &step {
+            self.asked = Some(call.clone());
+        }
+        step
+    }
+
+    /// Exception 6 says that the device has done nothing, and wants to be asked again. (5 says that it is
+    /// doing it: to repeat that would do it twice. What came of it is read back, as often as it takes.)
+    fn ask_busy_again(&mut self, write: &Write, result: &Result<Answer, RequestError>) -> Option<Step> {
+        let is_reading = matches!(self.asked, Some(Call::Read(_)));
+        let is_busy = match result {
+            Err(RequestError::Exception(ACKNOWLEDGE)) => is_reading,
+            Err(RequestError::Exception(6)) => true,
+            _ => false,
+        };
+        let most = if is_press(write) { BUSY_MAX_OF_PRESS } else { BUSY_MAX };
+        if !is_busy || self.busy >= most {
+            return None;
+        }
+        self.busy += 1;
+        Some(Step::AskLater(PAUSE_BUSY, self.asked.clone()?))
+    }
+
+    fn next_step(
+        &mut self,
+        device: &Device,
+        details: &Point,
+        write: &Write,
+        known: &[Option<i128>],
+        result: &Result<Answer, RequestError>,
+    ) -> Step {
         match self.state.clone() {
             State::ReadingBefore { field } => self.read_before(device, details, write, known, field, result),
             State::WritingBetween { field, then } => match result {
-                Ok(_) => {
+                Ok(_) | Err(RequestError::Exception(ACKNOWLEDGE)) => {
                     self.state = State::Writing { field };
                     Step::Ask(then)
                 }
@@ -256,18 +310,24 @@ impl CommandFlow {
     ) -> Step {
         let press = is_press(write);
         let doubt = match result {
-            Ok(_) if press && !is_self_clearing(write) => return self.finish(OutcomeKind::Done, None, None),
+            Ok(_) | Err(RequestError::Exception(ACKNOWLEDGE)) if press && !is_self_clearing(write) => {
+                return self.finish(OutcomeKind::Done, None, None);
+            }
             Ok(_) => None,
             Err(RequestError::Exception(3)) if device.wire.quirks.clamps_with_exception => {
                 Some(Doubt::Clamped)
             }
-            Err(RequestError::Exception(code)) => return self.refused_by_device(*code),
+            Err(RequestError::Exception(code)) if *code != ACKNOWLEDGE => {
+                return self.refused_by_device(*code);
+            }
             Err(error) if press => return self.finish(OutcomeKind::NoReply, None, Some(error.to_string())),
             Err(error) => Some(Doubt::NoAnswer(error.clone())),
         };
-        if write.settle > Duration::ZERO {
+        let is_doing_it = doubt == Some(Doubt::NoAnswer(RequestError::Exception(ACKNOWLEDGE)));
+        let settle = if is_doing_it { write.settle.max(PAUSE_BUSY) } else { write.settle };
+        if settle > Duration::ZERO {
             self.state = State::Settling { field, doubt };
-            return Step::Settle(write.settle);
+            return Step::Settle(settle);
         }
         self.state = State::ReadingBack { field, doubt };
         Step::Ask(Call::Read(details.at.span))
@@ -301,6 +361,10 @@ impl CommandFlow {
         let cleared = is_self_clearing(write) && held.iter().all(|word| *word == 0);
         if held == field || cleared {
             return self.finish(OutcomeKind::Done, found, None);
+        }
+        if doubt == Some(Doubt::NoAnswer(RequestError::Exception(ACKNOWLEDGE))) && self.busy < BUSY_MAX {
+            self.busy += 1;
+            return Step::AskLater(PAUSE_BUSY, Call::Read(details.at.span));
         }
         let reason = match doubt {
             Some(Doubt::NoAnswer(error)) => error.to_string(),

@@ -166,8 +166,7 @@ fn brute_force(device: &Device, refused: &[Span]) -> u64 {
     points.sort_by_key(|(index, address)| (address.span, address.bits, *index));
     let cost_of = |read: &Vec<(PointIndex, Address)>| {
         let read = read_of(Poll::Fast, read);
-        (read.points.len() == 1 || may_be_one_read(device, &read, refused))
-            .then(|| cost().of_read(read.span))
+        (read.points.len() == 1 || may_be_one_read(device, &read, refused)).then(|| cost().of_read(read.span))
     };
     let mut shared_out = vec![Vec::new()];
     for point in points {

@@ -175,6 +175,8 @@ pub enum Missing {
     NotText,
     /// The device answered the read with this exception.
     Exception(u8),
+    /// The device leaves the read without an answer, while it answers others; what came instead.
+    Unanswered(String),
 }
 
 impl Missing {
@@ -190,6 +192,7 @@ impl Missing {
             Missing::NotANumber => "not_a_number",
             Missing::NotText => "not_text",
             Missing::Exception(_) => "exception",
+            Missing::Unanswered(_) => "unanswered",
         }
     }
 }
@@ -206,6 +209,7 @@ impl fmt::Display for Missing {
             Missing::NotANumber => write!(f, "not a number"),
             Missing::NotText => write!(f, "not a text"),
             Missing::Exception(code) => write!(f, "exception {code}"),
+            Missing::Unanswered(error) => write!(f, "{error}, again and again"),
         }
     }
 }

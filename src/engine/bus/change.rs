@@ -31,7 +31,7 @@ impl Bus {
             let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, REASON);
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
-        self.end_settling_of(Some(index), &format!("written, but not read back: {REASON}"));
+        self.end_settling_of(Some(index), REASON);
         self.refuse_requests_of(index, REASON);
         self.beat = self.beat.take().filter(|(device, ..)| *device != index);
         // The answer to the one under way, which is the first, still comes.

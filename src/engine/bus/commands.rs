@@ -6,13 +6,13 @@ use std::collections::VecDeque;
 use crate::engine::address::Span;
 use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
 use crate::engine::device::PointIndex;
-use crate::engine::modbus::{Answer, RequestError};
+use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
 
 use super::device::DeviceState;
 use super::waiting::{Target, Waiting};
-use super::{Bus, Command, Purpose, Severity};
+use super::{Bus, Command, LinkState, Purpose, Severity};
 
 /// A command that has begun.
 pub(super) struct Active {
@@ -26,13 +26,22 @@ pub(super) struct Active {
     orders: VecDeque<(PointIndex, String)>,
 }
 
-/// A command that was written and waits until it can be read back.
+/// A command that waits until it can go on: most were written, and take their time until they can be read
+/// back.
 pub(super) struct Settling {
-    /// When it is read back with a request of its own.
+    /// When it goes on, mostly to be read back with a request of its own.
     until: Time,
     pub(super) active: Active,
     /// A poll that begins from now on answers as well.
     by_poll: bool,
+    /// What is asked then, if it is not read back yet.
+    next: Option<Call>,
+}
+
+impl Settling {
+    fn and_then(until: Time, active: Active, next: Call) -> Settling {
+        Settling { until, active, by_poll: false, next: Some(next) }
+    }
 }
 
 /// The poll that reads a command back is wanted at once. When even so it does not come within this time,
@@ -92,7 +101,7 @@ impl Bus {
         }
         self.refuse_requests();
         if self.in_flight.is_none() {
-            self.end_settling("written, but not read back: busker stops");
+            self.end_settling("busker stops");
             for device in &mut self.devices {
                 device.say_offline(&mut self.context);
             }
@@ -110,8 +119,10 @@ impl Bus {
         let all = std::mem::take(&mut self.settling).into_iter();
         let (ended, rest): (Vec<_>, Vec<_>) = all.partition(|settling| is_of_it(&settling.active));
         self.settling = rest;
-        for Settling { active, .. } in ended {
-            let outcome = Outcome::new(OutcomeKind::NoReply, &active.wanted, reason);
+        for Settling { active, next, .. } in ended {
+            let is_unwritten = next.is_some_and(|call| call.is_write());
+            let what = if is_unwritten { "not written" } else { "written, but not read back" };
+            let outcome = Outcome::new(OutcomeKind::NoReply, &active.wanted, format!("{what}: {reason}"));
             self.end_command(active, outcome);
         }
     }
@@ -123,7 +134,11 @@ impl Bus {
             return false;
         }
         if let Some(at) = self.settling.iter().position(|settling| settling.until <= self.now) {
-            let Settling { mut active, .. } = self.settling.remove(at);
+            let Settling { mut active, next, .. } = self.settling.remove(at);
+            if let Some(call) = next {
+                self.take_step(active, Step::Ask(call));
+                return true;
+            }
             let call = active.flow.settled(self.devices[active.device].device());
             let device = active.device;
             self.active = Some(active);
@@ -194,7 +209,7 @@ impl Bus {
                 self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
                 self.tell_outcome(device, target, of_target(target, wanted, outcome));
             }
-            (None, Step::Ask(_) | Step::Settle(_)) => {}
+            (None, Step::Ask(_) | Step::AskLater(..) | Step::Settle(_)) => {}
         }
     }
 
@@ -212,9 +227,25 @@ impl Bus {
     fn take_step(&mut self, active: Active, step: Step) {
         let (device, point) = (active.device, active.flow.point());
         match step {
+            // It goes on with another connection.
+            Step::Ask(call) if self.link_state == LinkState::Renewing => {
+                self.settling.push(Settling::and_then(self.now, active, call));
+            }
+            Step::Ask(_) if self.link_state != LinkState::Up => {
+                let mut active = active;
+                let state = &self.devices[device];
+                let lost = Err(RequestError::Link("the link is down".into()));
+                let step = active.flow.answered(state.device(), state.known(), &lost);
+                self.take_step(active, step);
+            }
             Step::Ask(_) if self.next_poll_confirms(&active) => {
                 self.devices[device].want_poll(point);
-                self.settling.push(Settling { until: self.now + POLL_AWAITED, active, by_poll: true });
+                self.settling.push(Settling {
+                    until: self.now + POLL_AWAITED,
+                    active,
+                    by_poll: true,
+                    next: None,
+                });
             }
             Step::Ask(call) => {
                 if let (true, Some(reason)) =
@@ -234,7 +265,10 @@ impl Bus {
                 self.send(device, call, Purpose::Command);
             }
             Step::Settle(time) => {
-                self.settling.push(Settling { until: self.now + time, active, by_poll: false });
+                self.settling.push(Settling { until: self.now + time, active, by_poll: false, next: None });
+            }
+            Step::AskLater(time, call) => {
+                self.settling.push(Settling::and_then(self.now + time, active, call));
             }
             Step::Finished(outcome) => {
                 let is_done = matches!(outcome.kind, OutcomeKind::Done | OutcomeKind::Unchanged);

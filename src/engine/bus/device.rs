@@ -11,6 +11,7 @@ mod telling;
 mod turnaround;
 mod wear;
 mod whole;
+mod withheld;
 
 use std::collections::BTreeMap;
 
@@ -38,13 +39,10 @@ use patience::{FAILURES_UNTIL_OFFLINE, Patience};
 use turnaround::Turnaround;
 use wear::Wear;
 use whole::Whole;
+use withheld::{PAUSE_BUSY_LONG, Withheld};
 
 /// A device that is not the one that the profile describes is asked again after this.
 const PAUSE_MISMATCH: Duration = Duration::from_secs(30);
-/// A read that the device answers with an exception is asked again after this.
-const PAUSE_EXCEPTION: Duration = Duration::from_secs(60);
-/// After "busy" (exceptions 5 and 6) the device is asked again after this.
-const PAUSE_BUSY: Duration = Duration::from_millis(200);
 
 pub(super) struct DeviceState {
     settings: DeviceSettings,
@@ -54,6 +52,7 @@ pub(super) struct DeviceState {
     polls: Polls,
     /// What the device has refused to give in one answer.
     refused: Vec<Span>,
+    withheld: Withheld,
     presence: Presence,
     patience: Patience,
     wear: Wear,
@@ -131,6 +130,7 @@ impl DeviceState {
             values,
             polls,
             refused: Vec::new(),
+            withheld: Withheld::default(),
             presence: Presence::Absent { reason: "not yet asked".into() },
             patience: Patience::default(),
             wear: Wear::new(eeprom),
@@ -245,7 +245,10 @@ impl DeviceState {
             }
         }
         let (index, urgency) = of_polls(&self.polls)?;
-        Some((self.read_call(index), urgency))
+        // Now and then another one than the most urgent: it may be that read alone which gets no answer.
+        let other = (self.presence != Presence::Present && self.patience.failures() % 3 == 1)
+            .then(|| self.polls.oldest(now));
+        Some((self.read_call(other.flatten().unwrap_or(index)), urgency))
     }
 
     pub(super) fn read_call(&self, index: usize) -> Polled {
@@ -361,6 +364,10 @@ impl DeviceState {
                 }
                 Err(found) => self.mistake(now, found, context),
             },
+            (Err(error @ RequestError::Exception(5 | 6)), _) => {
+                self.lose(now, &format!("it answers its identification with {error}"), context);
+                self.paused_until = now + PAUSE_BUSY_LONG;
+            }
             (Err(RequestError::Exception(code)), _) => {
                 let reason = format!("it answers its identification with exception {code}: another device?");
                 self.mistake(now, reason, context);
@@ -408,6 +415,7 @@ impl DeviceState {
         // It is asked as after a connect, selectors first: what lived only in another mode than the device
         // was in may not be answered at all.
         self.polls.want_all();
+        self.withheld.forget();
         self.beats.stop();
         self.upkeep.forget();
         self.tell_all(now, context);
@@ -454,6 +462,7 @@ impl DeviceState {
         match result {
             Ok(answer) => {
                 self.polls.end(index);
+                self.given(index, context);
                 let read = self.polls.shared_read(index);
                 let words = match answer {
                     Answer::Words(words) => words,
@@ -468,49 +477,19 @@ impl DeviceState {
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
                 self.failed(now, &error, context);
-                match (&self.presence, error) {
-                    (Presence::Present, RequestError::Timeout | RequestError::Unreachable(_)) => {
-                        self.polls.try_again(index, now)
-                    }
+                match (&self.presence, &error) {
+                    (
+                        Presence::Present,
+                        RequestError::Timeout | RequestError::Unreachable(_) | RequestError::Link(_),
+                    ) => self.polls.try_again(index, now),
                     // It is there, and only its answer was spoilt.
                     _ => self.polls.want_again(index),
                 }
+                self.unanswered(now, index, &error, context);
             }
         }
         self.after_news(now, context);
         self.adapt_plan(context);
-    }
-
-    /// The device answered a read with an exception: it is there, but will not tell this.
-    fn refused(&mut self, now: Time, index: usize, code: u8, context: &mut Context) {
-        let read = self.polls.read(index).clone();
-        if matches!(code, 5 | 6) {
-            self.polls.want_again(index);
-            self.polls.pause(index, now + PAUSE_BUSY);
-            return;
-        }
-        let suspects = if code == 2 { read.refused() } else { Vec::new() };
-        if !suspects.is_empty() {
-            self.refused.extend(suspects);
-            self.keeping.has_changed(context);
-            let reads = self.plan();
-            self.values.forget_words();
-            let values = &self.values;
-            self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
-            self.wake_reads();
-            let text = format!(
-                "device {}: {} cannot be read in one request, and will be read in parts",
-                self.settings.name, read.span
-            );
-            context.say(Severity::Info, text);
-            return;
-        }
-        self.polls.end(index);
-        self.polls.pause(index, now + PAUSE_EXCEPTION);
-        for (point, _) in &read.points {
-            self.values.lose(*point, Missing::Exception(code));
-            self.tell(now, *point, context);
-        }
     }
 
     fn absorb(&mut self, now: Time, read: &Read, words: &[u16], context: &mut Context) {

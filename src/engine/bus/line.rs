@@ -1,17 +1,14 @@
-//! What is wrong on a link that is open: requests that collide, another master, a connection that is mute.
+//! What is wrong on a line that is open: requests that collide, and another master.
 //!
 //! Modbus RTU has one master. A second one, perhaps a maker's tool that somebody has plugged in, is heard by
 //! the requests that are not ours. The link goes on: what collides with them is asked again.
 
 use std::collections::VecDeque;
 
-use super::{Action, Bus, InFlight, LinkState, Severity};
+use super::{Action, Bus, InFlight, Severity};
 use crate::engine::modbus::{Reply, Request, RequestError, RequestsOfOthers};
-use crate::engine::settings::Link;
 use crate::engine::time::{Duration, Time};
 
-/// After so many requests in a row that nobody answers, a TCP connection is made anew.
-const UNANSWERED_UNTIL_RENEWED: u32 = 5;
 /// So often a read that has collided is asked again before it counts as unanswered.
 const REPEATS_MAX: u32 = 3;
 /// The repetition comes at random within this time, or two masters that keep step would collide again.
@@ -110,17 +107,6 @@ impl Bus {
         self.in_flight = Some(InFlight { sent_at: not_before, ..in_flight });
         self.ask(request, not_before, timeout);
         None
-    }
-
-    /// A serial server may accept a connection and never pass anything on; only a new one helps. A
-    /// serial port has no such state.
-    pub(super) fn renew_silent_connection(&mut self) {
-        let is_connection = !matches!(self.link, Link::Serial { .. });
-        if is_connection && self.unanswered >= UNANSWERED_UNTIL_RENEWED && self.link_state == LinkState::Up {
-            self.unanswered = 0;
-            self.link_state = LinkState::Renewing;
-            self.context.actions.push_back(Action::Reopen { after: Duration::ZERO });
-        }
     }
 }
 

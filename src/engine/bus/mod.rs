@@ -10,6 +10,7 @@ mod device;
 mod fetch;
 mod inbox;
 mod line;
+mod link;
 mod load;
 mod pause;
 mod recording;
@@ -152,6 +153,7 @@ pub struct Bus {
     ahead: u32,
     pace: Pace,
     link_state: LinkState,
+    connection: link::Connection,
     /// A device on this link needs silence behind a connect: nothing is asked before.
     silent_until: Time,
     /// Requests in a row that no device on this link answered.
@@ -175,7 +177,7 @@ pub struct Bus {
 #[derive(Clone, Debug, PartialEq)]
 enum LinkState {
     Up,
-    /// Being closed and opened again because nothing answers on it.
+    /// Being closed and opened again, because nothing answers on it or the other side has closed it.
     Renewing,
     Down {
         reason: Option<String>,
@@ -260,6 +262,7 @@ impl Bus {
             ahead: 0,
             pace: Pace::default(),
             link_state: LinkState::Down { reason: None, attempts: 0 },
+            connection: link::Connection::default(),
             silent_until: now,
             unanswered: 0,
             broker_up: true,
@@ -399,61 +402,6 @@ impl Bus {
         }
     }
 
-    // What happened to the link.
-
-    fn link_up(&mut self) {
-        let delays = self.devices.iter().map(|device| device.device().wire.connect_delay);
-        self.silent_until = self.now + delays.max().unwrap_or_default();
-        self.record_note("the link is up");
-        match std::mem::replace(&mut self.link_state, LinkState::Up) {
-            // The devices are as silent as they were, and are asked as seldom.
-            LinkState::Renewing => return,
-            LinkState::Down { attempts, .. } if attempts > 0 => {
-                self.context.say(Severity::Info, format!("bus {}: the link is back", self.name));
-            }
-            LinkState::Paused { .. } => {
-                self.context.say(Severity::Info, format!("bus {}: the pause is over", self.name));
-            }
-            LinkState::Down { .. } | LinkState::Up => {}
-        }
-        for device in &mut self.devices {
-            device.reconnect(self.now);
-        }
-    }
-
-    fn link_down(&mut self, reason: String) {
-        let attempts = match &self.link_state {
-            LinkState::Up | LinkState::Renewing | LinkState::Paused { .. } => 0,
-            LinkState::Down { attempts, .. } => *attempts,
-        };
-        if attempts == 0 {
-            let text = format!("the link is down: {reason}");
-            self.context.say(Severity::Warning, format!("bus {}: {text}", self.name));
-            self.record_note(&text);
-            if self.in_flight.is_some() {
-                self.record_trouble(&text);
-            }
-        }
-        if let Some(in_flight) = self.in_flight.take() {
-            self.request_ended(in_flight, Err(RequestError::Link(reason.clone())));
-        }
-        self.leave_link(&format!("the link is down: {reason}"));
-        self.link_state = LinkState::Down { reason: Some(reason), attempts: attempts + 1 };
-        let after = Duration::from_millis(500 << attempts.min(6)).min(Duration::from_secs(15));
-        self.context.actions.push_back(Action::Reopen { after });
-    }
-
-    /// Nothing more can be asked, and why.
-    fn leave_link(&mut self, reason: &str) {
-        self.beat = None;
-        self.fetches.clear();
-        self.break_requests(reason);
-        self.end_settling(&format!("written, but not read back: {reason}"));
-        for device in &mut self.devices {
-            device.lose(self.now, reason, &mut self.context);
-        }
-    }
-
     // What happened to a request.
 
     fn reply(&mut self, reply: Reply) {
@@ -468,8 +416,12 @@ impl Bus {
             self.unanswered =
                 if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
         }
+        if matches!(reply.result, Ok(_) | Err(RequestError::Exception(_) | RequestError::Unreachable(_))) {
+            self.connection.answered(self.now);
+        }
         self.look_for_others(&reply);
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
+        self.renew_used_connection();
         self.request_ended(in_flight, reply.result);
         self.renew_silent_connection();
     }

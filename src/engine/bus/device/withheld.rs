@@ -1,0 +1,162 @@
+//! Reads that a device does not give although it is there: it refuses them, is busy, or leaves them without
+//! an answer while it answers others.
+//!
+//! Such a read is not the device's end. It is asked ever less often, so that waiting for it costs the bus
+//! little; its points say `None` and why; and the device is online with the rest.
+
+use crate::engine::device::Poll;
+use crate::engine::modbus::RequestError;
+use crate::engine::time::{Duration, Time};
+use crate::engine::value::Missing;
+
+use super::patience::FAILURES_UNTIL_OFFLINE;
+use super::{Context, DeviceState, Presence, Severity, Span};
+
+/// A read that the device answers with an exception is asked again after this.
+const PAUSE_EXCEPTION: Duration = Duration::from_secs(60);
+/// After "busy" (exceptions 5 and 6) the device is asked again after this.
+const PAUSE_BUSY: Duration = Duration::from_millis(200);
+/// One that is busy for so long is not done soon.
+const BUSY_LONG: Duration = Duration::from_secs(10);
+pub(super) const PAUSE_BUSY_LONG: Duration = Duration::from_secs(2);
+/// A read without an answer is left alone for so long, then for twice as long, and so on.
+const PAUSE_UNANSWERED: Duration = Duration::from_secs(5);
+const PAUSE_UNANSWERED_LONGEST: Duration = Duration::from_secs(60);
+
+/// The reads that are withheld now; of most devices none.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Withheld {
+    reads: Vec<WithheldRead>,
+}
+
+#[derive(Clone, Debug)]
+struct WithheldRead {
+    span: Span,
+    poll: Poll,
+    since: Time,
+    /// Times in a row without an answer that could be used.
+    failures: u32,
+}
+
+impl Withheld {
+    /// The device is to be asked as if for the first time.
+    pub(super) fn forget(&mut self) {
+        self.reads.clear();
+    }
+
+    fn read(&mut self, span: Span, poll: Poll, now: Time) -> &mut WithheldRead {
+        let known = self.reads.iter().position(|read| (read.span, read.poll) == (span, poll));
+        let at = known.unwrap_or_else(|| {
+            self.reads.push(WithheldRead { span, poll, since: now, failures: 0 });
+            self.reads.len() - 1
+        });
+        &mut self.reads[at]
+    }
+
+    /// It has been given, or refused for good; whether it had been left without an answer for long.
+    fn end(&mut self, span: Span, poll: Poll) -> bool {
+        if self.reads.is_empty() {
+            return false;
+        }
+        let known = self.reads.iter().position(|read| (read.span, read.poll) == (span, poll));
+        known.is_some_and(|at| self.reads.swap_remove(at).failures >= FAILURES_UNTIL_OFFLINE)
+    }
+}
+
+impl WithheldRead {
+    /// How long to leave it alone, once it has failed as often as a device may.
+    fn pause(&self) -> Option<Duration> {
+        let doublings = self.failures.checked_sub(FAILURES_UNTIL_OFFLINE)?;
+        Some((PAUSE_UNANSWERED * (1 << doublings.min(8))).min(PAUSE_UNANSWERED_LONGEST))
+    }
+}
+
+impl DeviceState {
+    /// The device has given the read.
+    pub(super) fn given(&mut self, index: usize, context: &mut Context) {
+        let read = self.polls.read(index);
+        let (span, poll) = (read.span, read.poll);
+        if self.withheld.end(span, poll) {
+            let text = format!("device {}: {span} is answered again", self.settings.name);
+            context.say(Severity::Info, text);
+        }
+    }
+
+    /// Nothing that can be used came for the read. If the device answers others, this one waits, and longer
+    /// each time.
+    pub(super) fn unanswered(
+        &mut self,
+        now: Time,
+        index: usize,
+        error: &RequestError,
+        context: &mut Context,
+    ) {
+        if self.presence != Presence::Present {
+            return;
+        }
+        let read = self.polls.shared_read(index);
+        let withheld = self.withheld.read(read.span, read.poll, now);
+        withheld.failures += 1;
+        let Some(pause) = withheld.pause() else { return };
+        if withheld.failures == FAILURES_UNTIL_OFFLINE {
+            let text = format!(
+                "device {}: {}: {error}, {FAILURES_UNTIL_OFFLINE} times in a row, while it answers others; what \
+                 stands there is told as missing, and asked for less often",
+                self.settings.name, read.span
+            );
+            context.say(Severity::Warning, text);
+        }
+        self.withhold(now, index, pause, &Missing::Unanswered(error.to_string()), context);
+    }
+
+    /// The device answered a read with an exception: it is there, but will not tell this.
+    pub(super) fn refused(&mut self, now: Time, index: usize, code: u8, context: &mut Context) {
+        let read = self.polls.read(index).clone();
+        if matches!(code, 5 | 6) {
+            let since = self.withheld.read(read.span, read.poll, now).since;
+            if now - since >= BUSY_LONG {
+                self.withhold(now, index, PAUSE_BUSY_LONG, &Missing::Exception(code), context);
+            } else {
+                self.polls.pause(index, now + PAUSE_BUSY);
+            }
+            self.polls.want_again(index);
+            return;
+        }
+        self.given(index, context);
+        let suspects = if code == 2 { read.refused() } else { Vec::new() };
+        if !suspects.is_empty() {
+            self.refused.extend(suspects);
+            self.keeping.has_changed(context);
+            let reads = self.plan();
+            self.values.forget_words();
+            let values = &self.values;
+            self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
+            self.wake_reads();
+            let text = format!(
+                "device {}: {} cannot be read in one request, and will be read in parts",
+                self.settings.name, read.span
+            );
+            context.say(Severity::Info, text);
+            return;
+        }
+        self.withhold(now, index, PAUSE_EXCEPTION, &Missing::Exception(code), context);
+    }
+
+    /// The read has been tried, and its points have no values; it is not asked again before `pause` is over.
+    fn withhold(
+        &mut self,
+        now: Time,
+        index: usize,
+        pause: Duration,
+        missing: &Missing,
+        context: &mut Context,
+    ) {
+        self.polls.end(index);
+        self.polls.pause(index, now + pause);
+        let read = self.polls.shared_read(index);
+        for (point, _) in &read.points {
+            self.values.lose(*point, missing.clone());
+            self.tell(now, *point, context);
+        }
+    }
+}
