@@ -22,6 +22,15 @@ pub fn print_json(data: &impl Serialize) -> Result<(), Failure> {
     print(&text)
 }
 
+/// `1 bus`, `2 buses`
+pub fn counted(count: usize, one: &str) -> String {
+    match (count, one) {
+        (1, one) => format!("1 {one}"),
+        (count, one) if one.ends_with('s') => format!("{count} {one}es"),
+        (count, one) => format!("{count} {one}s"),
+    }
+}
+
 /// Columns that are as wide as their widest cell.
 #[derive(Clone, Debug, Default)]
 pub struct Table {

@@ -1,6 +1,7 @@
 //! `busker run`: the service.
 
 use super::configuration::{ConfigurationArgs, Loaded};
+use super::output::counted;
 use super::{Failure, log};
 use crate::edge::app::App;
 use crate::edge::shutdown::{self, Heard};
@@ -34,7 +35,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     if let Some(address) = app.http_address() {
         tracing::info!("HTTP on http://{address}/health");
     }
-    tracing::info!("started with {devices} devices on {buses} buses");
+    tracing::info!("started with {} on {}", counted(devices, "device"), counted(buses, "bus"));
     shutdown::tell_ready();
     let name = loop {
         match app.wait(&mut signals) {

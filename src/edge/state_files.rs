@@ -30,6 +30,8 @@ pub struct StateFiles {
     memories: Mutex<Memories>,
     /// Devices whose files must not be overwritten.
     damaged: Mutex<BTreeSet<String>>,
+    /// Devices of which it has been said that nothing is remembered.
+    unknown: Mutex<BTreeSet<String>>,
     folder: PathBuf,
     recordings: Option<PathBuf>,
     desk: Arc<Desk>,
@@ -67,6 +69,7 @@ impl StateFiles {
     fn unkept(memories: Memories, recordings: Option<PathBuf>, lock: Option<File>) -> StateFiles {
         StateFiles {
             damaged: Mutex::default(),
+            unknown: Mutex::default(),
             memories: Mutex::new(memories),
             folder: PathBuf::new(),
             recordings,
@@ -120,6 +123,7 @@ impl StateFiles {
         Ok(StateFiles {
             memories: Mutex::new(memories),
             damaged: Mutex::default(),
+            unknown: Mutex::new(unknown.into_iter().map(String::from).collect()),
             folder: of_files,
             recordings: Some(state_dir.join("recordings")),
             desk,
@@ -151,7 +155,11 @@ impl StateFiles {
             }
             match recall(&file_of(&self.folder, device)) {
                 Ok(Some(memory)) => drop(memories.devices.insert(device.into(), memory)),
-                Ok(None) => tracing::info!("nothing is remembered yet of {device}"),
+                // It may be in use without anything to remember: then that is no news.
+                Ok(None) if lock(&self.unknown).insert(device.into()) => {
+                    tracing::info!("nothing is remembered yet of {device}");
+                }
+                Ok(None) => {}
                 Err(reason) => {
                     tracing::warn!("{reason}");
                     lock(&self.damaged).insert(device.into());

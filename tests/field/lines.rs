@@ -69,6 +69,13 @@ pub const ROWS: &[Row] = &[
         seen: "Every request is heard",
         run: second_stop_bit,
     },
+    Row {
+        number: 26,
+        fault: "A server closes its connections: each behind the answer, or one on which nothing was asked for a while",
+        done: "Modbus TCP and RTU over TCP: each connection is closed behind its first answer; later each that is idle for 300 ms",
+        seen: "Connects again at once, tells nobody, and loses no command; where each connection is good for one answer, makes one for each request",
+        run: closing_server,
+    },
 ];
 
 const THREE: &str = "  one: {bus: line, unit: 1, poll: {fast: 100ms}, points: {a: {at: input 0, poll: fast}}}
@@ -282,6 +289,31 @@ fn mute_server() {
         let stage = Stage::start(&peer, "response_timeout: 100ms", THREE, &THREE_SHOWN);
         stage.shows_all();
         assert!(peer.connections() >= 3);
+        stage.ends_well();
+    }
+}
+
+fn closing_server() {
+    for framing in [Framing::Tcp, Framing::Rtu] {
+        let peer = Peer::on_tcp(framing);
+        peer.misbehave(|_, good| vec![Step::Say(good), Step::HangUp]);
+        let devices = "  one: {bus: line, unit: 1, poll: {fast: 100ms}, points: {a: {at: input 0, poll: fast}, \
+                       b: {at: holding 7, poll: fast, write: 0..9}, c: {at: input 900, poll: fast}}}\n";
+        let shown = [("one/a", (1, 4, 0)), ("one/b", (1, 3, 7)), ("one/c", (1, 4, 900))];
+        let stage = Stage::start(&peer, "", devices, &shown);
+        stage.shows_all();
+        wait_for("a connection for each request", || (peer.connections() >= 10).then_some(()));
+        assert_eq!(stage.command("one/b", "5")["outcome"], "done");
+        stage.tells_changes();
+        assert_eq!(stage.counter("timeouts"), 0);
+        let was_offline =
+            |told: &[String]| told.iter().skip_while(|told| *told != "online").any(|told| told == "offline");
+        let availability = stage.watcher.payloads("busker/one/availability");
+        assert!(!was_offline(&availability), "{availability:?}");
+        let log = stage.gateway.log();
+        assert!(!log.iter().any(|line| line.contains("WARN")), "{log:?}");
+        // Now it closes only those on which it says nothing for a while; the polls come more seldom than that.
+        peer.misbehave(|_, good| vec![Step::Say(good), Step::Pause(300), Step::HangUp]);
         stage.ends_well();
     }
 }

@@ -1,5 +1,8 @@
 //! Rows about replies: late, damaged, in pieces, another's, none.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use crate::Row;
 use crate::peer::{Asked, Framing, Misbehave, Peer, Step, exception, read_pdu, reply, rtu};
 use crate::stage::{LIE, Shown, Stage};
@@ -75,6 +78,13 @@ pub const ROWS: &[Row] = &[
         done: "A unit answers without a pause, with a byte too many behind each checksum, and now and then with a frame twice",
         seen: "Takes the first whole reply; what comes behind it is dropped before the next request",
         run: sloppy,
+    },
+    Row {
+        number: 27,
+        fault: "A device leaves one read without an answer, for good, and answers all others",
+        done: "The first of three reads of a unit is never answered; later it is",
+        seen: "Finds that the unit is there, and shows the others; the points of that read are `None` with the reason, and it is asked ever less often, so that waiting for it costs the bus little",
+        run: one_unanswered,
     },
 ];
 
@@ -348,5 +358,34 @@ fn sloppy() {
     for _ in 0..5 {
         stage.tells_changes();
     }
+    stage.ends_well();
+}
+
+fn one_unanswered() {
+    let peer = Peer::on_a_pseudo_terminal();
+    let is_mute = Arc::new(AtomicBool::new(true));
+    let mute = is_mute.clone();
+    peer.misbehave(move |asked, good| match asked.address == 0 && mute.load(Ordering::SeqCst) {
+        true => Vec::new(),
+        false => vec![Step::Say(good)],
+    });
+    let devices = "  one:
+    bus: line
+    unit: 1
+    poll: {fast: 50ms, slow: 60s}
+    points: {a: {at: input 0, poll: fast}, b: {at: input 500, poll: fast}, c: {at: input 900, poll: slow}}
+";
+    let shown = [("one/b", (1, 4, 500))];
+    let stage = Stage::start(&peer, "response_timeout: 100ms", devices, &shown);
+    stage.shows_all();
+    stage.watcher.shows("busker/one/availability", "online");
+    let one = stage.device("one");
+    let reason = one["points"][0]["reason"].as_str().unwrap_or_default();
+    assert!(reason.contains("no answer in time"), "{one}");
+    let (from, in_vain) = (peer.asked().len(), stage.counter("timeouts"));
+    wait_for("a hundred reads", || (peer.asked().len() - from >= 100).then_some(()));
+    assert!(stage.counter("timeouts") - in_vain <= 3, "{}", stage.counter("timeouts"));
+    is_mute.store(false, Ordering::SeqCst);
+    stage.watcher.shows("busker/one/a", "0");
     stage.ends_well();
 }

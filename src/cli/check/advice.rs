@@ -71,7 +71,7 @@ fn of_these(devices: &[&DeviceSettings], class: &str, period: Duration) -> Strin
     }
 }
 
-/// The slowest usual rate at which the bus keeps its periods.
+/// The slowest usual rate at which the bus keeps its periods, if there is one.
 fn faster_line(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> Option<String> {
     let line = bus.link.line()?;
     let faster = BAUD_RATES.into_iter().filter(|baud| (line.baud + 1..=BAUD_MOST).contains(baud));
@@ -82,14 +82,11 @@ fn faster_line(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> 
         }
         Budget::of(&other, devices, turnaround).load()
     };
-    let found = faster.map(|baud| (baud, load_at(baud))).find(|(_, load)| *load <= COMFORTABLE);
-    Some(match found {
-        Some((baud, load)) => format!(
-            "raise `baud` to {baud} where all devices can: the bus is then busy {:.0} % of the time",
-            load * 100.0
-        ),
-        None => "no usual baud rate is enough by itself".into(),
-    })
+    let (baud, load) = faster.map(|baud| (baud, load_at(baud))).find(|(_, load)| *load <= COMFORTABLE)?;
+    Some(format!(
+        "raise `baud` to {baud} where all devices can: the bus is then busy {:.0} % of the time",
+        load * 100.0
+    ))
 }
 
 /// To two digits: nobody polls every 417 ms.

@@ -19,6 +19,8 @@ pub struct Planned {
     pub alone: bool,
     /// The silence before it, both frames, the device's turnaround.
     pub time: f64,
+    /// The silence that the device wants besides, in which others are asked.
+    pub rest: f64,
 }
 
 /// All reads of one bus.
@@ -43,14 +45,16 @@ impl Budget {
             longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
             wants.push(Wants::of(settings, tariff.cost(turnaround)));
             for read in plan(&settings.device, tariff.cost(planned_with), &[]) {
-                let time = tariff.cost(turnaround).time_of(read.span) + wire.limits.delay;
+                let time = tariff.cost(turnaround).time_of(read.span);
+                let rest = wire.limits.delay;
                 let period = match read.poll {
                     Poll::Fast => Some(wire.intervals.fast.as_secs_f64()),
                     Poll::Slow => Some(wire.intervals.slow.as_secs_f64()),
                     Poll::Once | Poll::Never => None,
                 };
-                let (poll, alone, time) = (read.poll, read.alone, time.as_secs_f64());
-                reads.push(Planned { device, poll, period, alone, time });
+                let (poll, alone) = (read.poll, read.alone);
+                let (time, rest) = (time.as_secs_f64(), rest.as_secs_f64());
+                reads.push(Planned { device, poll, period, alone, time, rest });
             }
         }
         let one_silent = match &bus.link {
@@ -90,8 +94,14 @@ impl Budget {
         let of_device = |(device, wants): (usize, &Wants)| {
             let reads = self.reads.iter().filter(|read| read.device == device);
             match wants.fed_every {
-                None => reads.filter_map(Planned::load).sum::<f64>() / stretch + wants.load_of_beats(),
-                Some(every) => round::load(&reads.collect::<Vec<_>>(), &wants.beats, every, stretch),
+                None => {
+                    let stretch = stretch.max(self.rests(device));
+                    reads.filter_map(Planned::load).sum::<f64>() / stretch + wants.load_of_beats()
+                }
+                Some(every) => {
+                    let stretch = stretch.max(self.rests(device));
+                    round::load(&reads.collect::<Vec<_>>(), &wants.beats, every, stretch)
+                }
             }
         };
         self.wants.iter().enumerate().map(of_device).sum()
@@ -109,12 +119,24 @@ impl Budget {
 
     /// The longest request that may be on the wire when something comes.
     pub fn longest(&self) -> f64 {
-        self.reads.iter().map(|read| read.time).fold(0.0, f64::max)
+        self.reads.iter().map(|read| read.time + read.rest).fold(0.0, f64::max)
+    }
+
+    /// How many times as long every period of a device is: as of all on its bus, or because it wants more
+    /// silence than its periods leave it.
+    pub fn stretch_of(&self, device: usize) -> f64 {
+        self.load().max(self.rests(device)).max(1.0)
+    }
+
+    /// How much of the time a device is asked or wants silence; above 1 its periods are longer by as much.
+    fn rests(&self, device: usize) -> f64 {
+        let of_device = self.reads.iter().filter(|read| read.device == device && read.rest > 0.0);
+        of_device.filter_map(|read| Some((read.time + read.rest) / read.period?)).sum()
     }
 
     /// How long it takes to read everything once that is read again and again.
     pub fn round(&self) -> f64 {
-        self.reads.iter().filter(|read| read.period.is_some()).map(|read| read.time).sum()
+        self.reads.iter().filter(|read| read.period.is_some()).map(|read| read.time + read.rest).sum()
     }
 }
 

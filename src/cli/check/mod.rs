@@ -11,7 +11,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::configuration::{self, ConfigurationArgs, Loaded};
-use super::output::{self, Table};
+use super::output::{self, Table, counted};
 use super::{Failure, output::print_json};
 use crate::edge::link::adapter;
 use crate::engine;
@@ -191,7 +191,7 @@ impl Summary {
                     format!("  {}", device.name),
                     format!("unit {}", device.unit),
                     device.profile.clone(),
-                    format!("{} points", device.points),
+                    counted(device.points, "point"),
                 ];
                 cells.extend(device.polls.iter().map(|(name, poll)| poll.text(name)));
                 table.row(cells);
@@ -228,7 +228,7 @@ impl BusSummary {
             let mut polls: BTreeMap<&'static str, PollSummary> = BTreeMap::new();
             for read in budget.reads.iter().filter(|read| read.device == number) {
                 // A bus that cannot keep up stretches every period by the same factor.
-                let real_period = read.period.map(|period| period * load.max(1.0));
+                let real_period = read.period.map(|period| period * budget.stretch_of(read.device));
                 let empty = PollSummary { reads: 0, seconds: 0.0, period: read.period, real_period };
                 let poll = polls.entry(read.poll.name()).or_insert(empty);
                 poll.reads += 1;

@@ -10,7 +10,7 @@ use anyhow::Context;
 use clap::Subcommand;
 
 use super::configuration::add_profiles;
-use super::output::{self, Table};
+use super::output::{self, Table, counted};
 use super::{Failure, configuration};
 use crate::engine::device::{Condition, Device, Encoding, Point, PointIndex, Poll, Unit, WriteRule};
 use crate::engine::profile::{self, Library};
@@ -137,10 +137,6 @@ fn check(mut library: Library, files: &[PathBuf]) -> Result<(), Failure> {
 
 /// `acme/ra8, 57 points, 2 things`
 fn summary(device: &Device) -> String {
-    let counted = |count: usize, one: &str| match count {
-        1 => format!("1 {one}"),
-        count => format!("{count} {one}s"),
-    };
     let mut parts = vec![device.profile.clone(), counted(device.points.len(), "point")];
     if !device.things.is_empty() {
         parts.push(counted(device.things.len(), "thing"));

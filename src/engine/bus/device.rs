@@ -213,10 +213,21 @@ impl DeviceState {
 
     /// When it wants to be asked again.
     pub(super) fn due_at(&self) -> Option<Time> {
+        let rested = self.paused_until.max(self.rested_at());
         match self.presence {
-            Presence::Present => self.polls.due_at().map(|due| due.max(self.paused_until)),
-            _ => Some(self.paused_until),
+            Presence::Present => self.polls.due_at().map(|due| due.max(rested)),
+            _ => Some(rested),
         }
+    }
+
+    /// Before, it wants silence. Others may be asked meanwhile.
+    fn rested_at(&self) -> Time {
+        self.last_answer_end + self.settings.device.wire.limits.delay
+    }
+
+    /// Whether something is due that only waits until the device has rested.
+    pub(super) fn only_rests(&self, now: Time) -> bool {
+        now < self.rested_at() && self.is_present() && self.polls.due_at().is_some_and(|due| due <= now)
     }
 
     pub(super) fn most_urgent(&self, now: Time) -> Option<(Polled, Urgency)> {
@@ -236,7 +247,7 @@ impl DeviceState {
         of_identification: U,
         of_polls: impl FnOnce(&Polls) -> Option<(usize, U)>,
     ) -> Option<(Polled, U)> {
-        if now < self.paused_until {
+        if now < self.paused_until || now < self.rested_at() {
             return None;
         }
         if self.presence != Presence::Present {
@@ -245,9 +256,8 @@ impl DeviceState {
             }
         }
         let (index, urgency) = of_polls(&self.polls)?;
-        // Now and then another one than the most urgent: it may be that read alone which gets no answer.
-        let other = (self.presence != Presence::Present && self.patience.failures() % 3 == 1)
-            .then(|| self.polls.oldest(now));
+        // After a request in vain another one than the most urgent: it may be that read alone which gets no answer.
+        let other = (self.patience.failures() % 3 == 1).then(|| self.polls.oldest(now));
         Some((self.read_call(other.flatten().unwrap_or(index)), urgency))
     }
 
@@ -297,7 +307,7 @@ impl DeviceState {
     /// The device is being asked: returns the time before which nothing may be sent.
     pub(super) fn asked(&mut self, now: Time) -> Time {
         self.served_at = now;
-        now.max(self.last_answer_end + self.settings.device.wire.limits.delay)
+        now.max(self.rested_at())
     }
 
     /// How long the next request may wait for its answer.

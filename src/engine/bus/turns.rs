@@ -55,7 +55,10 @@ impl Bus {
                 if read_before_setting || read_before_request {
                     continue;
                 }
-                self.pace.idle(now);
+                // (A device's rest is no spare time of a line that it has for itself.)
+                if self.devices.len() > 1 || !self.devices.iter().any(|device| device.only_rests(now)) {
+                    self.pace.idle(now);
+                }
                 // No read has had to wait for what went out of turn.
                 self.ahead = 0;
                 return;

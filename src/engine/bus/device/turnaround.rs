@@ -10,8 +10,10 @@ use crate::engine::time::{Duration, Time};
 
 use super::{Context, DeviceState, Severity};
 
-/// So many answers are looked at before a plan is thought over.
+/// So many answers are looked at before a plan is thought over; after each new plan twice as many, or one that
+/// makes a device look quick and slow in turn would be exchanged without end.
 const ANSWERS: u32 = 64;
+const DOUBLINGS_MAX: u32 = 10;
 /// No device is planned with less: below it, it is the program's own time that is measured.
 const LEAST: Duration = Duration::from_micros(200);
 
@@ -24,6 +26,8 @@ pub(super) struct Turnaround {
     typical: Duration,
     /// Answers since the plan was thought over.
     answers: u32,
+    /// How often it was far from what was measured.
+    changes: u32,
     /// The log has been told that it is slower than it may be.
     told_slow: bool,
 }
@@ -36,6 +40,7 @@ impl Default for Turnaround {
             planned_with,
             typical: planned_with,
             answers: 0,
+            changes: 0,
             told_slow: false,
         }
     }
@@ -62,12 +67,14 @@ impl Turnaround {
 
     /// What the reads should be planned with instead, if it is time to think it over.
     fn think_over(&mut self) -> Option<Duration> {
-        if self.answers < ANSWERS {
+        if self.answers < ANSWERS << self.changes.min(DOUBLINGS_MAX) {
             return None;
         }
         self.answers = 0;
         let typical = self.typical.max(LEAST);
-        plan::is_far(typical, self.planned_with).then_some(typical)
+        let is_far = plan::is_far(typical, self.planned_with);
+        self.changes += u32::from(is_far);
+        is_far.then_some(typical)
     }
 }
 
@@ -122,9 +129,10 @@ impl DeviceState {
         self.values.forget_words();
         self.wake_reads();
         let text = format!(
-            "device {}: it takes {} ms to answer, and is read with {after} requests instead of {before}",
+            "device {}: it takes {} ms to answer, and is read with {after} request{} instead of {before}",
             self.settings.name,
             (turnaround.as_secs_f64() * 10_000.0).round() / 10.0,
+            if after == 1 { "" } else { "s" },
         );
         context.say(Severity::Info, text);
     }
@@ -166,6 +174,17 @@ mod tests {
         ] {
             assert_eq!(thought(answers), expected, "{what}");
         }
+        // What the new plan itself makes look quick is planned ever more seldom.
+        let mut turnaround = Turnaround::default();
+        let mut plans = 0;
+        for _ in 0..10_000 {
+            turnaround.took(millis(if turnaround.planned_with > millis(20) { 1 } else { 60 }));
+            if let Some(wanted) = turnaround.think_over() {
+                turnaround.planned_with = wanted;
+                plans += 1;
+            }
+        }
+        assert!(plans <= 8, "{plans}");
         // It changes for good: in a step or two, and then no more.
         let plans = thought(always(5, 200).chain(always(50, 1000)));
         assert!(plans.len() <= 2 && plans.last().is_some_and(|last| *last > 25), "{plans:?}");
