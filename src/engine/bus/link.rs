@@ -9,8 +9,12 @@ use crate::engine::modbus::RequestError;
 use crate::engine::settings::Link;
 use crate::engine::time::{Duration, Time};
 
-/// After so many requests in a row that nobody answers, a TCP connection is made anew.
+/// After so many requests in a row that nobody answers, a TCP connection is made anew; where only one device
+/// is behind it, already when that one counts as offline, for then it is asked but seldom.
 const UNANSWERED_UNTIL_RENEWED: u32 = 5;
+const UNANSWERED_BY_THE_ONLY_ONE: u32 = 3;
+/// And again after so many, if the new one is as mute.
+const UNANSWERED_AGAIN: u32 = 2;
 /// So often in a row a connection that is closed without an answer is made anew in silence, if there were
 /// answers before.
 const CLOSED_IN_SILENCE: u32 = 3;
@@ -39,6 +43,8 @@ pub(super) struct Connection {
     single_uses: u32,
     /// How often in a row it came up and broke without an answer.
     breaks: u32,
+    /// It was made anew because nobody answered, and nobody has answered since.
+    is_renewed_for_silence: bool,
 }
 
 impl Connection {
@@ -48,6 +54,7 @@ impl Connection {
         self.answered_at = now;
         self.is_proven = true;
         self.closed_in_silence = 0;
+        self.is_renewed_for_silence = false;
     }
 
     /// The other side wants one request on each connection.
@@ -165,12 +172,19 @@ impl Bus {
     /// A serial server may accept a connection and never pass anything on; only a new one helps. A
     /// serial port has no such state.
     pub(super) fn renew_silent_connection(&mut self) {
-        if self.is_connection()
-            && self.unanswered >= UNANSWERED_UNTIL_RENEWED
-            && self.link_state == LinkState::Up
-        {
+        if !self.is_connection() || self.link_state != LinkState::Up {
+            return;
+        }
+        let connection = &self.connection;
+        let most = match self.devices.len() {
+            _ if connection.is_renewed_for_silence => UNANSWERED_AGAIN,
+            1 => UNANSWERED_BY_THE_ONLY_ONE,
+            _ => UNANSWERED_UNTIL_RENEWED,
+        };
+        if self.unanswered >= most {
             self.unanswered = 0;
             self.renew();
+            self.connection.is_renewed_for_silence = true;
         }
     }
 
