@@ -77,10 +77,6 @@ impl Reporter {
         *lock(&self.configuration_error) = error;
     }
 
-    pub fn configuration_error(&self) -> Option<String> {
-        lock(&self.configuration_error).clone()
-    }
-
     /// What was last on the wire of this bus.
     pub async fn recording(&self, bus: &str) -> Result<Recording, NoRecording> {
         let named = |watched: &&Arc<Watched>| lock(&watched.last).name == bus;
