@@ -227,6 +227,10 @@ fn wait_alone(runner: &mut BusRunner, punctual: &mut Punctual) -> Woken {
         (Woken { bell: false, .. }, Some(until)) => {
             punctual.slept(since, until, clock.now());
             while exactly.is_some_and(|at| clock.now() < at) {
+                // A command that comes now still goes before the poll.
+                if runner.bell().rings() {
+                    return Woken { bell: true, link: false };
+                }
                 std::hint::spin_loop();
             }
         }
