@@ -21,6 +21,7 @@ use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
 use crate::engine::health::{self, BusReport, DeviceReport, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
+use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
@@ -225,7 +226,8 @@ pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock) -> Bro
 pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
     let of_bus = |bus: &Arc<BusHandle>| {
         let first = bus.first_summary();
-        let (bus, of_recording) = (bus.clone(), bus.clone());
+        let (bus, of_call, of_recording) = (bus.clone(), bus.clone(), bus.clone());
+        let call = move || of_call.inspect(|_, _| ());
         let ask_recording =
             move || of_recording.inspect(|bus, now| bus.recording(now, "on request over HTTP"));
         let ask = move |detail| {
@@ -235,7 +237,7 @@ pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
                 Detail::Readings => bus.readings(now),
             })
         };
-        Arc::new(Watched::new(ask, ask_recording, first))
+        Arc::new(Watched::new(ask, call, ask_recording, first))
     };
     buses.iter().map(of_bus).collect()
 }
@@ -249,8 +251,23 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
     let mut told_at: Vec<String> = Vec::new();
     let mut told_info = info(&plant.settings(), &plant.topics());
     let mut tell_at = Instant::now();
+    let mut seen = None;
+    let mut has_stirred = true;
     loop {
         let now = Instant::now();
+        let broker = plant.broker();
+        if broker.connected && plant.settings().home_assistant.discovery {
+            let store =
+                |outbox: &Outbox| outbox.announced().iter().for_each(|told| state.store_announced(told));
+            plant.mailbox().look(store);
+        }
+        let is_news = has_stirred || now >= tell_at || seen != Some(broker.client_id_taken);
+        seen = Some(broker.client_id_taken);
+        if !is_news && reporter.all_respond().await {
+            shutdown::feed_watchdog();
+            has_stirred = stirs(&plant, now, (now + ask_every).min(tell_at), pause).await;
+            continue;
+        }
         let report = reporter.report(Detail::Devices).await;
         let responding = report.buses.iter().all(|bus| bus.responding);
         if responding {
@@ -277,9 +294,6 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
                 mailbox.push(Message::retained(topics.of_device(&bus.name, &device.name).health(), health));
             }
         }
-        if report.broker.connected && plant.settings().home_assistant.discovery {
-            mailbox.look(|outbox| outbox.announced().iter().for_each(|told| state.store_announced(told)));
-        }
         let info = plant.info(&report);
         if told_info != info {
             mailbox.push(info.clone());
@@ -287,9 +301,18 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
         }
         // A bus that is stuck does not say when it goes on.
         let next = if responding { (now + ask_every).min(tell_at) } else { now + pause };
-        tokio::select! {
-            () = sleep_until(next) => {}
-            () = plant.stir().stirred() => sleep_until(now + pause).await,
+        has_stirred = stirs(&plant, now, next, pause).await || !responding;
+    }
+}
+
+/// Waits until something stirs (`true`), though not less than `pause` after the look at `looked_at`; or until
+/// `next`.
+async fn stirs(plant: &Plant, looked_at: Instant, next: Instant, pause: Duration) -> bool {
+    tokio::select! {
+        () = sleep_until(next) => false,
+        () = plant.stir().stirred() => {
+            sleep_until(looked_at + pause).await;
+            true
         }
     }
 }
