@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use tokio::task::JoinHandle;
+use tokio::time::{Instant, sleep_until};
 
 use crate::edge::bus_thread::{BusHandle, Threads};
 use crate::edge::clock::Clock;
@@ -20,15 +21,16 @@ use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
 use crate::engine::health::{self, BusReport, DeviceReport, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
+use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 use crate::engine::topics::{Message, Topics};
 
-/// How often the gateway looks whether anything has changed for the worse or the better, which is told at
-/// once. The rest is told each minute.
+/// What changes for the worse or the better is told at once, but not more often than this. The rest is told
+/// each minute.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// How often it asks each bus although none has anything new: it may be stuck.
+/// How often each bus is asked although nothing has stirred: it may be stuck.
 const ASK_EVERY: Duration = Duration::from_secs(10);
 const TELL_HEALTH_EVERY: Duration = Duration::from_secs(60);
 
@@ -87,7 +89,7 @@ impl App {
         recall(&plant, &state);
         introduce(&plant.settings(), &plant.topics(), &plant.mailbox());
         let everyone = 0..plant.settings().buses.len();
-        let threads = Threads::default();
+        let threads = Threads::new(plant.stir().clone());
         let buses = start_buses(&threads, &plant, everyone, clock, &state)?;
         plant.set_buses(buses.clone());
 
@@ -224,7 +226,8 @@ pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock) -> Bro
 pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
     let of_bus = |bus: &Arc<BusHandle>| {
         let first = bus.first_summary();
-        let (bus, of_recording) = (bus.clone(), bus.clone());
+        let (bus, of_call, of_recording) = (bus.clone(), bus.clone(), bus.clone());
+        let call = move || of_call.inspect(|_, _| ());
         let ask_recording =
             move || of_recording.inspect(|bus, now| bus.recording(now, "on request over HTTP"));
         let ask = move |detail| {
@@ -234,37 +237,39 @@ pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
                 Detail::Readings => bus.readings(now),
             })
         };
-        Arc::new(Watched::new(ask, ask_recording, first))
+        Arc::new(Watched::new(ask, call, ask_recording, first))
     };
     buses.iter().map(of_bus).collect()
 }
 
-/// Looks at the gateway again and again: tells its health, and feeds systemd's watchdog while every
-/// bus answers.
+/// Looks at the gateway when something stirs, and now and then when nothing does: tells its health, and feeds
+/// systemd's watchdog while every bus answers.
 pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc<StateFiles>) {
-    let watchdog = shutdown::watchdog_interval().unwrap_or(ASK_EVERY);
-    let every = watchdog.min(LOOK_EVERY);
-    let rounds = |time: Duration| (time.as_millis() / every.as_millis().max(1)).max(1);
-    let (rounds_to_tell, rounds_to_ask) = (rounds(TELL_HEALTH_EVERY), rounds(watchdog.min(ASK_EVERY)));
-    let mut ticks = tokio::time::interval(every);
+    let ask_every = shutdown::watchdog_interval().map_or(ASK_EVERY, |watchdog| watchdog.min(ASK_EVERY));
+    let pause = LOOK_EVERY.min(ask_every);
     let mut told: Option<Vec<bool>> = None;
     let mut told_at: Vec<String> = Vec::new();
     let mut told_info = info(&plant.settings(), &plant.topics());
+    let mut tell_at = Instant::now();
     let mut seen = None;
-    let mut responding = true;
-    for round in 0u128.. {
-        ticks.tick().await;
-        // All are looked at, so that none is asked for nothing the next time.
-        let stirred = plant.buses().iter().filter(|bus| bus.take_stirred()).count() > 0;
+    let mut has_stirred = true;
+    loop {
+        let now = Instant::now();
         let broker = plant.broker();
-        let others = (broker.connected, broker.client_id_taken, reporter.configuration_error());
-        let is_new = seen.as_ref() != Some(&others) || stirred || !responding;
-        if !is_new && round % rounds_to_ask != 0 && round % rounds_to_tell != 0 {
+        if broker.connected && plant.settings().home_assistant.discovery {
+            let store =
+                |outbox: &Outbox| outbox.announced().iter().for_each(|told| state.store_announced(told));
+            plant.mailbox().look(store);
+        }
+        let is_news = has_stirred || now >= tell_at || seen != Some(broker.client_id_taken);
+        seen = Some(broker.client_id_taken);
+        if !is_news && reporter.all_respond().await {
+            shutdown::feed_watchdog();
+            has_stirred = stirs(&plant, now, (now + ask_every).min(tell_at), pause).await;
             continue;
         }
-        seen = Some(others);
         let report = reporter.report(Detail::Devices).await;
-        responding = report.buses.iter().all(|bus| bus.responding);
+        let responding = report.buses.iter().all(|bus| bus.responding);
         if responding {
             shutdown::feed_watchdog();
         }
@@ -274,8 +279,11 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
             |(bus, device): (&BusReport, &DeviceReport)| topics.of_device(&bus.name, &device.name).health();
         let places: Vec<String> = report.devices().map(of_device).chain([topics.bridge_health()]).collect();
         // After a reload a device may be new, or tell it elsewhere.
-        let is_time = round % rounds_to_tell == 0 || told_at != places;
+        let is_time = now >= tell_at || told_at != places;
         told_at = places;
+        if is_time {
+            tell_at = now + TELL_HEALTH_EVERY;
+        }
         if is_time || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             told = Some(states);
@@ -286,13 +294,25 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
                 mailbox.push(Message::retained(topics.of_device(&bus.name, &device.name).health(), health));
             }
         }
-        if report.broker.connected && plant.settings().home_assistant.discovery {
-            mailbox.look(|outbox| outbox.announced().iter().for_each(|told| state.store_announced(told)));
-        }
         let info = plant.info(&report);
         if told_info != info {
             mailbox.push(info.clone());
             told_info = info;
+        }
+        // A bus that is stuck does not say when it goes on.
+        let next = if responding { (now + ask_every).min(tell_at) } else { now + pause };
+        has_stirred = stirs(&plant, now, next, pause).await || !responding;
+    }
+}
+
+/// Waits until something stirs (`true`), though not less than `pause` after the look at `looked_at`; or until
+/// `next`.
+async fn stirs(plant: &Plant, looked_at: Instant, next: Instant, pause: Duration) -> bool {
+    tokio::select! {
+        () = sleep_until(next) => false,
+        () = plant.stir().stirred() => {
+            sleep_until(looked_at + pause).await;
+            true
         }
     }
 }

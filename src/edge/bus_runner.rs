@@ -13,6 +13,7 @@ use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::{Link, Lost};
 use crate::edge::recordings;
 use crate::edge::state_files::StateFiles;
+use crate::edge::stir::Stir;
 use crate::engine::bus::{Action, Bus, Event, Inbox, Severity};
 use crate::engine::health::BusReport;
 use crate::engine::modbus::Reply;
@@ -37,7 +38,7 @@ pub(super) struct Ears {
     pub(super) looks: Receiver<Look>,
     pub(super) bell: Bell,
     pub(super) stop: Arc<AtomicBool>,
-    pub(super) stirred: Arc<AtomicBool>,
+    pub(super) stir: Arc<Stir>,
     pub(super) ended: SyncSender<Saving>,
 }
 
@@ -71,8 +72,7 @@ pub(super) struct BusRunner {
     bell: Bell,
     stop: Arc<AtomicBool>,
     stopping: bool,
-    /// Something has happened that may be of interest for how the gateway is.
-    stirred: Arc<AtomicBool>,
+    stir: Arc<Stir>,
     /// When the bus was last told the date.
     dated_at: Option<Time>,
     /// The link was opened since somebody asked.
@@ -91,7 +91,7 @@ impl BusRunner {
         ears: Ears,
     ) -> BusRunner {
         let bus = Bus::new(clock.now(), &settings, index, &state.memories());
-        let Ears { inbox, looks, bell, stop, stirred, ended } = ears;
+        let Ears { inbox, looks, bell, stop, stir, ended } = ears;
         BusRunner {
             settings,
             index,
@@ -106,7 +106,7 @@ impl BusRunner {
             bell,
             stop,
             stopping: false,
-            stirred,
+            stir,
             dated_at: None,
             is_newly_open: false,
             ended,
@@ -214,7 +214,7 @@ impl BusRunner {
                 Action::Publish(message) => {
                     // Of a device that is there its values are told, and nothing else.
                     if message.topic.ends_with("/availability") || message.topic.ends_with("/info") {
-                        self.stir();
+                        self.stir.stir();
                     }
                     (self.publish)(message);
                 }
@@ -222,14 +222,14 @@ impl BusRunner {
                 Action::Record { recording, request } => self.record(*recording, request),
                 Action::Reopen { after } => {
                     self.port = Port::Waiting(self.clock.now() + after);
-                    self.stir();
+                    self.stir.stir();
                 }
                 Action::Say(severity, text) => {
                     match severity {
                         Severity::Info => tracing::info!("{text}"),
                         Severity::Warning => tracing::warn!("{text}"),
                     }
-                    self.stir();
+                    self.stir.stir();
                 }
             }
         }
@@ -274,7 +274,7 @@ impl BusRunner {
                     let guard = Guard::new(&bus.link, bus.gap);
                     self.port = Port::Open(Box::new(GuardedLink::new(link, guard, self.clock)));
                     self.is_newly_open = true;
-                    self.stir();
+                    self.stir.stir();
                     self.handle(Event::LinkUp);
                 }
                 Ok(Err(lost)) => self.lose(lost),
@@ -286,10 +286,6 @@ impl BusRunner {
                 self.line_said(said);
             }
         }
-    }
-
-    fn stir(&self) {
-        self.stirred.store(true, Ordering::Relaxed);
     }
 
     fn open(&self) -> Port {
@@ -341,7 +337,7 @@ impl BusRunner {
     /// another name.
     pub(super) fn lose(&mut self, Lost(reason): Lost) {
         self.port = Port::Closed;
-        self.stir();
+        self.stir.stir();
         self.handle(Event::LinkDown(reason));
     }
 }

@@ -22,6 +22,7 @@ use crate::edge::guarded_link::{Woken, wait};
 use crate::edge::link::{Lost, timespec};
 use crate::edge::punctual::Punctual;
 use crate::edge::state_files::StateFiles;
+use crate::edge::stir::Stir;
 use crate::engine::bus::{Bus, Command, Event, Full, Inbox};
 use crate::engine::health::BusReport;
 use crate::engine::settings::{Link, Settings};
@@ -34,7 +35,6 @@ pub struct BusHandle {
     looks: SyncSender<Look>,
     bell: Bell,
     stop: Arc<AtomicBool>,
-    stirred: Arc<AtomicBool>,
     first: BusReport,
     ended: Mutex<Option<Receiver<Saving>>>,
 }
@@ -69,11 +69,6 @@ impl BusHandle {
         self.first.clone()
     }
 
-    /// Whether anything has happened since this was last asked, but that devices answered as they should.
-    pub fn take_stirred(&self) -> bool {
-        self.stirred.swap(false, Ordering::Relaxed)
-    }
-
     /// Asks the bus to finish the request in flight, refuse what waits, say `offline` and end.
     pub fn shutdown(&self) {
         self.stop.store(true, Ordering::SeqCst);
@@ -94,9 +89,15 @@ impl BusHandle {
 #[derive(Default)]
 pub struct Threads {
     shared: Mutex<Option<Arc<Shared>>>,
+    stir: Arc<Stir>,
 }
 
 impl Threads {
+    /// The threads stir when anything happens but that devices answer as they should.
+    pub fn new(stir: Arc<Stir>) -> Threads {
+        Threads { shared: Mutex::default(), stir }
+    }
+
     /// Starts the bus number `index`. `publish` is called on its thread and must not wait.
     pub fn start(
         &self,
@@ -110,7 +111,6 @@ impl Threads {
         let (looks, looks_in) = sync_channel(LOOKS_MAX);
         let (ended, end) = sync_channel(1);
         let stop = Arc::new(AtomicBool::new(false));
-        let stirred = Arc::new(AtomicBool::new(true));
         let shares = matches!(settings.buses[index].link, Link::Tcp { .. });
         let shared = if shares { Some(self.shared()?) } else { None };
         let bell = match &shared {
@@ -122,7 +122,7 @@ impl Threads {
             looks: looks_in,
             bell: bell.clone(),
             stop: stop.clone(),
-            stirred: stirred.clone(),
+            stir: self.stir.clone(),
             ended,
         };
         let name = format!("bus-{}", settings.buses[index].name);
@@ -138,7 +138,7 @@ impl Threads {
                 std::thread::Builder::new().name(name).spawn(move || run_alone(runner))?;
             }
         }
-        Ok(BusHandle { inbox, looks, bell, stop, stirred, first, ended: Mutex::new(Some(end)) })
+        Ok(BusHandle { inbox, looks, bell, stop, first, ended: Mutex::new(Some(end)) })
     }
 
     /// The thread for connections, which begins with the first of them.
@@ -227,6 +227,10 @@ fn wait_alone(runner: &mut BusRunner, punctual: &mut Punctual) -> Woken {
         (Woken { bell: false, .. }, Some(until)) => {
             punctual.slept(since, until, clock.now());
             while exactly.is_some_and(|at| clock.now() < at) {
+                // A command that comes now still goes before the poll.
+                if runner.bell().rings() {
+                    return Woken { bell: true, link: false };
+                }
                 std::hint::spin_loop();
             }
         }

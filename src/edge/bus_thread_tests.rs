@@ -1,9 +1,12 @@
 //! A bus's thread and its handle, on a pseudo-terminal whose far end the test holds.
 
+use std::future::Future;
 use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::os::fd::OwnedFd;
+use std::pin::pin;
 use std::sync::mpsc::{Receiver, channel};
+use std::task::{Context, Waker};
 
 use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 
@@ -40,12 +43,14 @@ fn nowhere() -> Arc<StateFiles> {
 }
 
 fn run(settings: Arc<Settings>) -> (BusHandle, Receiver<Message>) {
+    run_with(&Threads::default(), settings)
+}
+
+fn run_with(threads: &Threads, settings: Arc<Settings>) -> (BusHandle, Receiver<Message>) {
     let (sender, messages) = channel();
     // The test may have heard enough.
     let publish = move |message| drop(sender.send(message));
-    let bus = Threads::default()
-        .start(settings, 0, Clock::start(), nowhere(), Box::new(publish))
-        .expect("a thread");
+    let bus = threads.start(settings, 0, Clock::start(), nowhere(), Box::new(publish)).expect("a thread");
     (bus, messages)
 }
 
@@ -217,21 +222,23 @@ fn connections_share_a_thread_and_end_one_by_one() {
 #[test]
 fn a_bus_is_stirred_by_what_happens_to_devices_and_not_by_what_they_tell() {
     let (far, path) = line();
-    let (bus, messages) = run(settings(&path, "30s"));
+    let stir = Arc::<Stir>::default();
+    let is_stirred = || pin!(stir.stirred()).poll(&mut Context::from_waker(Waker::noop())).is_ready();
+    let (bus, messages) = run_with(&Threads::new(stir.clone()), settings(&path, "30s"));
     hear_request(&far);
     answer(&far, 21);
     wait_for(&messages, "busker/one/availability", "online");
     // What else comes with it is told by now.
     bus.inspect(|_, _| ()).blocking_recv().expect("the thread lives");
-    assert!(bus.take_stirred());
+    assert!(is_stirred());
     hear_request(&far);
     answer(&far, 22);
     wait_for(&messages, "busker/one/a", "22");
     bus.inspect(|_, _| ()).blocking_recv().expect("the thread lives");
-    assert!(!bus.take_stirred());
+    assert!(!is_stirred());
     drop(far);
     wait_for(&messages, "busker/one/availability", "offline");
-    assert!(bus.take_stirred());
+    assert!(is_stirred());
     bus.shutdown();
     bus.join();
 }

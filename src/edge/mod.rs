@@ -20,4 +20,5 @@ pub mod runtime;
 pub mod secrets;
 pub mod shutdown;
 pub mod state_files;
+pub mod stir;
 pub mod tls;

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::clock::Clock;
 use crate::edge::mqtt::{BrokerState, Mailbox, News};
+use crate::edge::stir::Stir;
 use crate::engine::bus::{Command, Event, Full, REPLACED};
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::health::{BrokerReport, GatewayReport};
@@ -18,6 +19,7 @@ use crate::engine::topics::{DeviceTopics, Message, Topics};
 /// The running parts.
 pub struct Plant {
     clock: Clock,
+    stir: Arc<Stir>,
     parts: Mutex<Parts>,
 }
 
@@ -65,7 +67,7 @@ fn bus_of(settings: &Settings) -> BTreeMap<String, usize> {
 impl Plant {
     /// As these settings want it, but with nothing running yet.
     pub fn new(settings: Settings, library: Library, clock: Clock) -> Plant {
-        Plant { clock, parts: Mutex::new(Parts::new(settings, library)) }
+        Plant { clock, stir: Arc::default(), parts: Mutex::new(Parts::new(settings, library)) }
     }
 
     /// The same once more, with an empty mailbox.
@@ -88,6 +90,11 @@ impl Plant {
 
     pub fn set_connection(&self, connection: BrokerState) {
         self.parts().connection = Some(connection);
+    }
+
+    /// Who changes how the gateway is stirs this.
+    pub fn stir(&self) -> &Arc<Stir> {
+        &self.stir
     }
 
     pub fn settings(&self) -> Arc<Settings> {
@@ -124,6 +131,9 @@ impl Plant {
 
     /// Brings what the broker tells to the buses that it concerns.
     pub fn tell(&self, news: News) {
+        if matches!(news, News::Up | News::Down) {
+            self.stir.stir();
+        }
         let mut parts = self.parts();
         match news {
             News::Up => parts.tell_all(&Event::BrokerUp),

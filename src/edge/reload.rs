@@ -69,12 +69,14 @@ impl App {
             self.exchange_http(listener, listen.as_deref())?;
         }
         self.reporter.set_configuration_error(None);
+        self.plant.stir().stir();
         Ok(())
     }
 
     /// The new configuration was no good, and why; everything goes on as it was.
     pub fn refuse_reload(&self, reason: &str) {
         self.reporter.set_configuration_error(Some(reason.into()));
+        self.plant.stir().stir();
     }
 
     fn begin_anew(
