@@ -2,6 +2,7 @@
 
 use std::env;
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -70,6 +71,31 @@ impl Loaded {
             found.push(self.at(&["http", "token_file"], format!("{error:#}")));
         }
         found
+    }
+
+    /// Secrets that everybody on this machine can read.
+    pub fn open_secrets(&self) -> Vec<Diagnostic> {
+        let Settings { mqtt, http, .. } = &self.settings;
+        let of_password = |secret: &Password| match secret {
+            Password::File(path) => Some(path.clone()),
+            Password::None | Password::Given(_) => None,
+        };
+        let client = mqtt.tls.as_ref().and_then(|tls| tls.client.as_ref());
+        let files: [(&[&str], Option<PathBuf>); 3] = [
+            (&["mqtt", "password_file"], of_password(&mqtt.password)),
+            (&["mqtt", "tls", "key_file"], client.map(|client| client.key_file.clone())),
+            (&["http", "token_file"], of_password(&http.token)),
+        ];
+        let open = files.into_iter().filter_map(|(keys, path)| {
+            let path = path?;
+            let mode = fs::metadata(&path).ok()?.permissions().mode();
+            let shown = path.display();
+            let message = || {
+                format!("everybody on this machine can read `{shown}`; `chmod o= {shown}` keeps them from it")
+            };
+            (mode & 0o004 != 0).then(|| self.at(keys, message()))
+        });
+        open.collect()
     }
 
     /// What ports that may change their names are called for good, where the system tells it. `folder` is
@@ -192,6 +218,25 @@ mod tests {
         assert!(told[0].contains(&expected), "{told:?}");
         assert_eq!(check(&stable), Vec::<String>::new());
         assert_eq!(check(Path::new("/dev/no-such")), Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_secret_that_everybody_can_read_is_told_with_what_mends_it() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let (file, secret) = (folder.path().join("busker.yaml"), folder.path().join("password"));
+        fs::write(&secret, "s3cret\n").expect("a password");
+        let text = format!("mqtt: {{username: busker, password_file: {}}}\nbuses: {{}}\n", secret.display());
+        fs::write(&file, text).expect("a configuration");
+        for (mode, expected) in [(0o600, 0), (0o640, 0), (0o644, 1)] {
+            fs::set_permissions(&secret, fs::Permissions::from_mode(mode)).expect("it is ours");
+            let Ok(Ok(loaded)) = load(&file) else { panic!("the configuration is good") };
+            let told: Vec<String> = loaded.open_secrets().iter().map(ToString::to_string).collect();
+            assert_eq!(told.len(), expected, "{told:?}");
+            assert!(
+                told.iter().all(|told| told.contains("chmod o= ") && !told.contains("s3cret")),
+                "{told:?}"
+            );
+        }
     }
 
     #[test]

@@ -14,7 +14,7 @@ use crate::edge::link::{Link, Lost};
 use crate::edge::recordings;
 use crate::edge::state_files::StateFiles;
 use crate::edge::stir::Stir;
-use crate::engine::bus::{Action, Bus, Event, Inbox, Severity};
+use crate::engine::bus::{Action, Bus, Event, Inbox, STOPPING, Severity};
 use crate::engine::health::BusReport;
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
@@ -257,7 +257,7 @@ impl BusRunner {
         self.stopping = true;
         self.handle(Event::Shutdown);
         if let Port::Open(link) = &mut self.port {
-            if let Some(reply) = link.withdraw("busker stops") {
+            if let Some(reply) = link.withdraw(STOPPING) {
                 self.handle(Event::Reply(reply));
             }
         }

@@ -150,21 +150,35 @@ impl Plant {
                 parts.carry_out(decision);
             }
             News::Set { device, point, payload, retained } => {
-                let command = Command { device: device.clone(), point, payload, retained };
-                let (command, outcome) = match parts.tell_bus_of(&device, Event::Command(command.clone())) {
-                    Ok(None) => return,
-                    Ok(Some(older)) => (older, (OutcomeKind::Expired, REPLACED)),
-                    Err(Full) => (command, (OutcomeKind::Refused, "too many commands wait")),
-                };
-                let outcome = Outcome::new(outcome.0, &command.payload, outcome.1);
-                let topic = parts.topics_of(&device).outcome(&command.point);
-                parts.mailbox.push(Message::once(topic, outcome.to_json()));
+                parts.command(Command { device, point, payload, retained });
             }
         }
     }
 }
 
 impl Parts {
+    fn command(&self, command: Command) {
+        let device = command.device.clone();
+        if let Some(outcome) = self.desk.refusal_of_set(&device, &command.payload) {
+            // What is retained is nobody's wish of now.
+            if !command.retained {
+                self.tell_outcome(&device, &command.point, &outcome);
+            }
+            return;
+        }
+        let (command, kind, reason) = match self.tell_bus_of(&device, Event::Command(command.clone())) {
+            Ok(None) => return,
+            Ok(Some(older)) => (older, OutcomeKind::Expired, REPLACED),
+            Err(Full) => (command, OutcomeKind::Refused, "too many commands wait"),
+        };
+        self.tell_outcome(&device, &command.point, &Outcome::new(kind, &command.payload, reason));
+    }
+
+    fn tell_outcome(&self, device: &str, point: &str, outcome: &Outcome) {
+        let topic = self.topics_of(device).outcome(point);
+        self.mailbox.push(Message::once(topic, outcome.to_json()));
+    }
+
     fn carry_out(&self, decision: Decision) {
         match decision {
             Decision::Ask(bus, request) => {

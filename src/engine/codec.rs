@@ -253,6 +253,7 @@ fn read_one(resolved: &Resolved<'_>, words: &[u16]) -> Reading {
     match raw {
         Raw::Nonsense if form.kind.is_text() => Reading::Missing(Missing::NotText),
         Raw::Nonsense => Reading::Missing(Missing::NotANumber),
+        Raw::Text(text) if text.is_empty() => Reading::Missing(Missing::EmptyText),
         Raw::Text(text) => Reading::Text(text),
         Raw::Float(number) => read_float(resolved, number),
         Raw::Integer(raw) => read_integer(resolved, raw),
@@ -320,11 +321,17 @@ fn read_float(resolved: &Resolved<'_>, raw: f64) -> Reading {
         let digits = if form.kind == Kind::F32 { 6 } else { 14 };
         value = format!("{value:.digits$e}").parse().unwrap_or(value);
     }
-    if let Some(decimals) = resolved.decimals {
-        value = format!("{value:.*}", usize::from(decimals)).parse().unwrap_or(value);
+    let Some(decimals) = resolved.decimals else {
+        // Minus zero is told as zero.
+        return Reading::Float(value + 0.0);
+    };
+    let text = format!("{value:.*}", usize::from(decimals));
+    match Decimal::parse(&text) {
+        // With all the digits that were asked for: 2.50.
+        Some(number) => Reading::Number(number),
+        // Too large for a decimal, so that it has no digits behind the dot anyway.
+        None => Reading::Float(text.parse().unwrap_or(value) + 0.0),
     }
-    // Minus zero is told as zero.
-    Reading::Float(value + 0.0)
 }
 
 /// Between which values a number may be written, in the unit shown.

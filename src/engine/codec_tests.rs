@@ -83,6 +83,13 @@ fn floats_are_told_shortest_and_without_exponent() {
     check_read(Form::new(Kind::F32), "FF80 0000", "None");
     check_read(with(Kind::F32, |form| form.scale = decimal("0.001")), "41A8 CCCD", "0.0211");
     check_read(with(Kind::F32, |form| form.decimals = Some(Decimals::Fixed(2))), "4049 0FDB", "3.14");
+    // With the digits that were asked for, also where they are zeros.
+    let two_digits = || with(Kind::F32, |form| form.decimals = Some(Decimals::Fixed(2)));
+    check_read(two_digits(), "4020 0000", "2.50");
+    check_read(two_digits(), "BA83 126F", "0.00");
+    check_read(two_digits(), "60AD 78EC", "100000000000000000000.00");
+    let beyond_a_decimal = with(Kind::F64, |form| form.decimals = Some(Decimals::Fixed(1)));
+    check_read(beyond_a_decimal, "47EF FFFF E091 FF3D", "340282347000000000000000000000000000000");
 }
 
 #[test]
@@ -110,6 +117,7 @@ fn texts_codes_and_dates() {
     check_read(Form::new(Kind::Text { registers: 3 }), "4D52 2D38 0000", "MR-8");
     check_read(with(Kind::Text { registers: 2 }, |form| form.order = Order::Badc), "524D 3820", "MR 8");
     check_read(Form::new(Kind::Text { registers: 1 }), "FF01", "None");
+    check_read(Form::new(Kind::Text { registers: 2 }), "0000 2000", "None");
     check_read(Form::new(Kind::LetterNumber), "5211", "R017");
     check_read(Form::new(Kind::LetterNumber), "0011", "None");
     check_read(Form::new(Kind::DayMonthYear), "03FA", "01.01.2018");

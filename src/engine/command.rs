@@ -102,9 +102,20 @@ impl OutcomeKind {
     }
 }
 
+/// More bytes than any value has: the longest text fills 125 registers. What is longer is no value, and is not
+/// repeated in an outcome, which no broker would take.
+const WISH_BYTES_MAX: usize = 1024;
+
 impl Outcome {
     pub fn new(kind: OutcomeKind, wanted: &str, reason: impl Into<String>) -> Outcome {
-        Outcome { kind, wanted: wanted.to_string(), found: None, reason: Some(reason.into()) }
+        Outcome { kind, wanted: shortened(wanted), found: None, reason: Some(reason.into()) }
+    }
+
+    /// Why `wanted` is not even looked at, if it is too long to be a value.
+    pub fn of_too_long(wanted: &str) -> Option<Outcome> {
+        let bytes = wanted.len();
+        let reason = || format!("{bytes} bytes are no value; expected at most {WISH_BYTES_MAX}");
+        (bytes > WISH_BYTES_MAX).then(|| Outcome::new(OutcomeKind::Refused, wanted, reason()))
     }
 
     /// `{"outcome":"done","wanted":"ON","found":"ON","reason":null}`
@@ -383,6 +394,15 @@ impl CommandFlow {
     }
 }
 
+/// As it is, or the beginning of what is too long.
+fn shortened(wanted: &str) -> String {
+    if wanted.len() <= WISH_BYTES_MAX {
+        return wanted.to_string();
+    }
+    let beginning: String = wanted.chars().take(100).collect();
+    format!("{beginning}…")
+}
+
 /// A read's words, one for each address: a bit is 0 or 1.
 pub fn words_of(answer: &Answer) -> Vec<u16> {
     match answer {
@@ -440,4 +460,20 @@ fn meaning_of_whole_register(device: &Device, register: Span, held: u16) -> Opti
                 .find(|(value, _)| *value == i128::from(held))
                 .map(|(value, name)| format!("{value} ({name})"))
         })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_too_long_to_be_a_value_is_refused_and_not_repeated_as_a_whole() {
+        assert_eq!(Outcome::of_too_long(&"7".repeat(WISH_BYTES_MAX)), None);
+        let outcome = Outcome::of_too_long(&"ß".repeat(5_000_000)).expect("it is refused");
+        assert_eq!(outcome.kind, OutcomeKind::Refused);
+        assert_eq!(outcome.wanted, format!("{}…", "ß".repeat(100)));
+        assert_eq!(outcome.reason.as_deref(), Some("10000000 bytes are no value; expected at most 1024"));
+        let outcome = Outcome::new(OutcomeKind::Expired, &"7".repeat(5_000_000), "too old");
+        assert!(outcome.to_json().len() < 500);
+    }
 }

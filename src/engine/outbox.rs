@@ -107,7 +107,7 @@ impl Outbox {
             self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
             self.tells_once_more = true;
         }
-        self.pace.told();
+        self.pace.told(self.is_answer(&message));
         Some(message)
     }
 
@@ -137,7 +137,7 @@ impl Outbox {
 
     /// A message from [`Outbox::next_message`] could not be handed over: it is next again.
     pub fn put_back(&mut self, message: Message) {
-        self.pace.take_back();
+        self.pace.take_back(self.is_answer(&message));
         let lane = self.lane(&message.topic);
         if !message.retain {
             self.queue.push_front(lane, Queued::Once(Box::new(message)));
@@ -271,6 +271,11 @@ impl Outbox {
         if let Some(value) = value {
             self.queue.push_back(lane, value);
         }
+    }
+
+    /// Whether it ends what somebody asked for; an event counts as one, too.
+    fn is_answer(&self, message: &Message) -> bool {
+        !message.retain && matches!(self.lane(&message.topic), Lane::Others)
     }
 
     fn queue_last(&mut self, queued: Queued) {
@@ -463,6 +468,19 @@ mod tests {
         assert_eq!(told.last().map(String::as_str), Some("busker/bridge/state"));
         assert_eq!(told.len(), outbox.retained.len());
         assert!(outbox.is_empty());
+    }
+
+    #[test]
+    fn the_outcomes_of_a_flood_go_as_fast_as_it_comes_and_still_fit_in_a_readers_queue() {
+        let mut outbox = outbox();
+        (0..ONCE_MAX).for_each(|number| once(&mut outbox, "busker/a/x/outcome", &number.to_string()));
+        let mut now = LATER;
+        while !outbox.is_empty() {
+            let burst = std::iter::from_fn(|| outbox.next_message(now)).count();
+            assert!((1..1000).contains(&burst), "{burst} at once");
+            now += PERIOD;
+        }
+        assert!(now - LATER < Duration::from_secs(2), "{:?}", now - LATER);
     }
 
     #[test]

@@ -9,6 +9,7 @@ use std::sync::{Arc, Weak};
 use serde_json::{Map, Value as Json, json};
 
 use crate::engine::address::Span;
+use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::device::Identify;
 use crate::engine::profile::Library;
 use crate::engine::settings::{Link, Settings};
@@ -252,6 +253,19 @@ impl Desk {
         Decision::Answer(answer(&self.topics, verb, &transaction, Status::Error, Json::Null, Some(&error)))
     }
 
+    /// The outcome of a message on a `set` topic that is for no bus: of no device, or too long to be a value.
+    pub fn refusal_of_set(&self, device: &str, wanted: &str) -> Option<Outcome> {
+        if !self.bus_of.contains_key(device) {
+            return Some(Outcome::new(OutcomeKind::Refused, wanted, self.no_device(device)));
+        }
+        Outcome::of_too_long(wanted)
+    }
+
+    fn no_device(&self, name: &str) -> String {
+        let names: Vec<&str> = self.bus_of.keys().map(String::as_str).collect();
+        format!("there is no device `{name}`; {}", list_of_choices(name, &names))
+    }
+
     fn read(&mut self, today: Date, verb: Verb, payload: &str) -> Result<(usize, Wish), String> {
         let object = Object::parse(verb, payload)?;
         match verb {
@@ -302,10 +316,7 @@ impl Desk {
         let name = object.text("device")?.ok_or_else(|| object.missing("device"))?;
         match self.bus_of.get(name) {
             Some(bus) => Ok((name.to_string(), *bus)),
-            None => {
-                let names: Vec<&str> = self.bus_of.keys().map(String::as_str).collect();
-                Err(format!("there is no device `{name}`; {}", list_of_choices(name, &names)))
-            }
+            None => Err(self.no_device(name)),
         }
     }
 
@@ -498,6 +509,17 @@ devices:
         let Decision::Ask(1, Request { wish: Wish::Scan(scan), .. }) = found else { panic!("{found:?}") };
         assert_eq!((scan.first, scan.last), (3, 255));
         assert!(scan.known.iter().any(|(id, _)| id == "metz-connect/mr-do4"));
+    }
+
+    #[test]
+    fn a_command_for_no_device_is_refused_and_so_is_a_book() {
+        let desk = desk();
+        let reason = |device: &str, wanted: &str| desk.refusal_of_set(device, wanted)?.reason;
+        assert_eq!(reason("relays", "ON"), None);
+        let meant = "there is no device `relay`; did you mean `relays`?";
+        assert_eq!(reason("relay", "ON").as_deref(), Some(meant));
+        let long = "5000 bytes are no value; expected at most 1024";
+        assert_eq!(reason("relays", &"7".repeat(5000)).as_deref(), Some(long));
     }
 
     #[test]

@@ -12,6 +12,9 @@ pub const AVAILABILITY: &str = "availability";
 pub const INFO: &str = "info";
 pub const HEALTH: &str = "health";
 
+/// No topic of ours is longer.
+const TOPIC_BYTES_MAX: usize = 1024;
+
 /// One message for the broker.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Message {
@@ -126,6 +129,10 @@ impl Topics {
 
     /// What a message on `topic` asks for; `None` if it is none of our business.
     pub fn parse<'t>(&self, topic: &'t str) -> Option<Incoming<'t>> {
+        // The answer's topic is a little longer, and must not be longer than a topic can be.
+        if topic.len() > TOPIC_BYTES_MAX {
+            return None;
+        }
         let levels = self.below(topic)?;
         match levels[..] {
             ["bridge", "request", verb] if !verb.is_empty() => return Some(Incoming::Request { verb }),
@@ -271,6 +278,13 @@ mod tests {
 
     fn check_parse(base: &str, topic: &str, expected: Option<Incoming>) {
         assert_eq!(Topics::new(base).parse(topic), expected, "{topic}");
+    }
+
+    #[test]
+    fn a_topic_to_which_no_answer_could_be_written_is_none_of_ours() {
+        let long = "x".repeat(65_500);
+        check_parse("busker", &format!("busker/bridge/request/{long}"), None);
+        check_parse("busker", &format!("busker/relays/{long}/set"), None);
     }
 
     #[test]

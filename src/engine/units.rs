@@ -92,6 +92,43 @@ pub fn digits_of_a_float(unit: Option<&str>) -> u8 {
     }
 }
 
+/// The units that Home Assistant knows and `unit` may stand for: it takes any text for one, but `kwh` and `degC`
+/// are no energy and no temperature to it. Empty for what it knows, and for what is like nothing it knows.
+pub fn meant_by(unit: &str) -> Vec<&'static str> {
+    let all = || CLASSES.iter().flat_map(|class| class.units.list());
+    if all().any(|known| known == normalized(unit)) {
+        return Vec::new();
+    }
+    let mut meant: Vec<&str> = all().filter(|known| loosely(known) == loosely(unit)).collect();
+    meant.sort_unstable();
+    meant.dedup();
+    meant
+}
+
+/// A unit as it is typed by who does not find the keys for it.
+fn loosely(unit: &str) -> String {
+    let letters = unit.trim().to_lowercase();
+    let letters = letters.strip_prefix("deg").unwrap_or(&letters);
+    let plain = letters.chars().filter(|c| !matches!(c, '°' | '^' | ' ' | '.'));
+    plain
+        .map(|c| match c {
+            '²' => '2',
+            '³' => '3',
+            '₂' => '2',
+            '\u{b5}' | '\u{3bc}' => 'u',
+            '⋅' => '*',
+            c => c,
+        })
+        .collect()
+}
+
+/// The units of which a number of this device class needs one for Home Assistant to make anything of it; `None`
+/// if it needs none.
+pub fn needed_by(class: &str) -> Option<String> {
+    let found = CLASSES.iter().find(|candidate| candidate.name == class)?;
+    matches!(found.units, Units::OneOf(_)).then(|| quoted(found.units.list()))
+}
+
 /// The unit as Home Assistant spells it: its micro is the Greek letter.
 pub fn normalized(unit: &str) -> String {
     unit.replace('\u{b5}', "\u{3bc}")
@@ -420,6 +457,30 @@ mod tests {
             ("Ω", false, None),
         ] {
             assert_eq!(class_of_unit(unit, difference), expected, "{unit}");
+        }
+    }
+
+    #[test]
+    fn a_unit_that_is_spelt_otherwise_is_understood() {
+        for (unit, meant) in [
+            ("kwh", &["kWh"][..]),
+            ("KWH", &["kWh"]),
+            ("C", &["°C"]),
+            ("degC", &["°C"]),
+            ("deg F", &["°F"]),
+            ("m3", &["m³"]),
+            ("m^3/h", &["m³/h"]),
+            ("l/min", &["L/min"]),
+            ("VAr", &["var"]),
+            ("ug/m3", &["μg/m³"]),
+            ("mw", &["MW", "mW"]),
+            ("kWh", &[]),
+            ("mW", &[]),
+            ("\u{b5}V", &[]),
+            ("imp", &[]),
+            ("Ω", &[]),
+        ] {
+            assert_eq!(meant_by(unit), meant, "{unit}");
         }
     }
 

@@ -319,13 +319,16 @@ impl Upkeep {
             (Err(reason), _) | (_, Err(reason)) => return Standing::Faulty { found, reason },
         };
         match reading {
-            // It was read, and is nothing that could be wanted.
-            Reading::Missing(
-                missing @ (Missing::UnknownValue(_) | Missing::NotANumber | Missing::NotText),
-            ) => Standing::Differs { found: missing.to_string(), command },
-            Reading::Missing(_) => Standing::Unknown { found },
             // Compared as it would be read: 30, 30.0 and 30s are one time.
             reading if *reading == codec::read(&resolved, &words) => Standing::Right,
+            // It was read, and is nothing that could be wanted.
+            Reading::Missing(
+                missing @ (Missing::UnknownValue(_)
+                | Missing::NotANumber
+                | Missing::NotText
+                | Missing::EmptyText),
+            ) => Standing::Differs { found: missing.to_string(), command },
+            Reading::Missing(_) => Standing::Unknown { found },
             reading => Standing::Differs { found: reading.to_string(), command },
         }
     }

@@ -173,6 +173,9 @@ pub enum Missing {
     NotANumber,
     /// The text register held no text.
     NotText,
+    /// It held a text without a letter. Told as such it would be no value on MQTT: an empty message deletes what
+    /// the broker keeps, and Home Assistant passes over it.
+    EmptyText,
     /// The device answered the read with this exception.
     Exception(u8),
     /// The device leaves the read without an answer, while it answers others; what came instead.
@@ -191,6 +194,7 @@ impl Missing {
             Missing::UnknownValue(_) => "unknown_value",
             Missing::NotANumber => "not_a_number",
             Missing::NotText => "not_text",
+            Missing::EmptyText => "empty_text",
             Missing::Exception(_) => "exception",
             Missing::Unanswered(_) => "unanswered",
         }
@@ -208,6 +212,7 @@ impl fmt::Display for Missing {
             Missing::UnknownValue(raw) => write!(f, "unknown value {raw}"),
             Missing::NotANumber => write!(f, "not a number"),
             Missing::NotText => write!(f, "not a text"),
+            Missing::EmptyText => write!(f, "an empty text"),
             Missing::Exception(code) => write!(f, "exception {code}"),
             Missing::Unanswered(error) => write!(f, "{error}, again and again"),
         }

@@ -58,7 +58,7 @@ pub fn settings(header: &str) -> Settings {
         },
         http: Http { listen: None, token: Password::None },
         state_dir: "/nowhere".into(),
-        republish: Duration::from_secs(600),
+        republish: Duration::from_secs(if says("republish soon") { 35 } else { 600 }),
         on_broker_loss: if says("stop feeding") { OnBrokerLoss::StopFeeding } else { OnBrokerLoss::Keep },
         eeprom: Eeprom {
             interval: Duration::from_secs(60),

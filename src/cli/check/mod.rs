@@ -73,6 +73,8 @@ fn checked(args: &Args) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
     Ok(loaded.and_then(|mut loaded| {
         let secret_faults = loaded.secret_faults();
         loaded.warnings.extend(secret_faults);
+        let open_secrets = loaded.open_secrets();
+        loaded.warnings.extend(open_secrets);
         let stable_paths = loaded.stable_paths(Path::new(adapter::BY_ID));
         loaded.warnings.extend(stable_paths);
         let faults = loaded.tls_faults();
@@ -174,7 +176,7 @@ impl Summary {
             text.push_str(&format!("\nbus {}: {}{line}\n", bus.name, bus.link));
             text.push_str(&format!(
                 "  busy {:.0} % of the time; a command waits at most {}, {} while a device is silent\n",
-                bus.load * 100.0,
+                (bus.load * 100.0).max(0.0),
                 told(bus.command_wait),
                 told(bus.command_wait_one_silent),
             ));

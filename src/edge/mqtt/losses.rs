@@ -51,6 +51,9 @@ impl Ends {
                 "the broker at {address} has closed the connection: it ends, or another client has come with \
              the identifier `{client_id}`"
             ),
+            error if told(error) == "bytes remaining on stream" => {
+                format!("the connection to the broker at {address} is cut off in the middle of a message")
+            }
             error => format!("the connection to the broker at {address} is lost: {}", told(error)),
         }
     }

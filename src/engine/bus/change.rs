@@ -9,7 +9,7 @@ use super::device::DeviceState;
 use super::{Action, Bus, InFlight, LinkState, Purpose};
 
 /// What commands and requests of a device are told that leaves.
-const REASON: &str = "the configuration of the device has changed";
+pub(super) const CHANGED: &str = "the configuration of the device has changed";
 
 impl Bus {
     /// The device begins nothing more, and is gone as soon as nothing of it is on the wire:
@@ -28,11 +28,11 @@ impl Bus {
             self.waiting.take_all().into_iter().partition(|waiting| waiting.device == index);
         self.waiting.put_all(others);
         for waiting in of_it {
-            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, REASON);
+            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, CHANGED);
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
-        self.end_settling_of(Some(index), REASON);
-        self.refuse_requests_of(index, REASON);
+        self.end_settling_of(Some(index), CHANGED);
+        self.refuse_requests_of(index, CHANGED);
         self.beat = self.beat.take().filter(|(device, ..)| *device != index);
         // The answer to the one under way, which is the first, still comes.
         let is_under_way = |in_flight: &InFlight| matches!(in_flight.purpose, Purpose::Fetch);

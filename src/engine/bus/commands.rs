@@ -9,7 +9,9 @@ use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
+use crate::engine::yaml::nearest;
 
+use super::change::CHANGED;
 use super::device::DeviceState;
 use super::waiting::{Target, Waiting};
 use super::{Bus, Command, LinkState, Purpose, Severity};
@@ -44,6 +46,10 @@ impl Settling {
     }
 }
 
+/// What commands and requests are told that a bus leaves behind when it ends: it does not know which of the two
+/// it is.
+pub const STOPPING: &str = "busker stops, or begins this bus anew";
+
 /// The poll that reads a command back is wanted at once. When even so it does not come within this time,
 /// the command is read back by itself.
 const POLL_AWAITED: Duration = Duration::from_secs(1);
@@ -51,7 +57,12 @@ const POLL_AWAITED: Duration = Duration::from_secs(1);
 impl Bus {
     /// A message on a `set` topic.
     pub(super) fn command(&mut self, command: Command) {
-        let Some((device, target)) = self.find(&command.device, &command.point) else { return };
+        let Some((device, target)) = self.find(&command.device, &command.point) else {
+            if !command.retained {
+                self.refuse_unknown(&command);
+            }
+            return;
+        };
         if command.retained {
             if self.devices[device].warn_of_retained(target) {
                 let topic = self.context.topics_of(&command.device).set(&command.point);
@@ -78,6 +89,22 @@ impl Bus {
         }
     }
 
+    /// There is no such point, or its device is just being exchanged for what a new configuration says of it.
+    fn refuse_unknown(&mut self, command: &Command) {
+        let Command { device, point, payload, .. } = command;
+        let reason = match self.devices.iter().find(|state| state.name() == device) {
+            Some(state) => {
+                let meant =
+                    nearest(point, &state.names_to_set()).map(|name| format!("; did you mean `{name}`?"));
+                format!("`{device}` has no point `{point}`{}", meant.unwrap_or_default())
+            }
+            None => CHANGED.to_string(),
+        };
+        let topic = self.context.topics_of(device).outcome(point);
+        let outcome = Outcome::new(OutcomeKind::Refused, payload, reason);
+        self.context.publish(Message::once(topic, outcome.to_json()));
+    }
+
     pub(super) fn expire_commands(&mut self) {
         for mut waiting in self.waiting.take_expired(self.now) {
             let device = &self.devices[waiting.device];
@@ -96,12 +123,12 @@ impl Bus {
 
     pub(super) fn refuse_what_waits(&mut self) {
         for waiting in self.waiting.take_all() {
-            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, "busker stops");
+            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, STOPPING);
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
         self.refuse_requests();
         if self.in_flight.is_none() {
-            self.end_settling("busker stops");
+            self.end_settling(STOPPING);
             for device in &mut self.devices {
                 device.say_offline(&mut self.context);
             }

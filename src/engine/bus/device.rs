@@ -481,7 +481,8 @@ impl DeviceState {
                 let absorbed = self.values.absorb_poll(now, &self.settings.device, &read, &words);
                 if !absorbed.is_told || !self.tell_anyway.is_empty() {
                     self.learn(now, &read, absorbed, context);
-                    self.values.has_been_told(&read, context.republish);
+                    let again = self.told_again_after(read.poll, context.republish);
+                    self.values.has_been_told(&read, again);
                 }
             }
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
@@ -524,7 +525,8 @@ impl DeviceState {
             context.say(Severity::Warning, text);
         }
         for (point, _) in &read.points {
-            if !self.tell_anyway.is_empty() || self.values.may_be_told(now, *point, context.republish) {
+            let again = self.told_again_after(self.details(*point).poll, context.republish);
+            if !self.tell_anyway.is_empty() || self.values.may_be_told(now, *point, again) {
                 self.tell(now, *point, context);
             }
         }

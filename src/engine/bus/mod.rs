@@ -35,6 +35,7 @@ use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settin
 use crate::engine::time::{Date, Duration, Time};
 use crate::engine::topics::Message;
 
+pub use commands::STOPPING;
 use commands::{Active, Settling};
 use context::Context;
 use device::{DeviceState, Turn};

@@ -16,6 +16,7 @@ use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::request::{Request, Status, Wish};
 use crate::engine::time::{Duration, Time};
 
+use super::commands::STOPPING;
 use super::device::DeviceState;
 use super::waiting::Target;
 use super::{Bus, LinkState, Purpose};
@@ -370,7 +371,7 @@ impl Bus {
 
     /// The program ends.
     pub(super) fn refuse_requests(&mut self) {
-        let reason = "busker stops";
+        let reason = STOPPING;
         for Waiting { request, .. } in std::mem::take(&mut self.requests.waiting) {
             self.refuse(&request, reason);
         }

@@ -13,13 +13,14 @@ mod words;
 
 pub use words::BAUD_RATES;
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::engine::address::Span;
 use crate::engine::configuration::file::Configuration;
 use crate::engine::configuration::words::{Listen, Name, Part, Unit};
-use crate::engine::device::Device;
+use crate::engine::device::{self, Device};
 use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
@@ -270,6 +271,7 @@ impl Resolver<'_> {
                 let settings = read_part(&device.settings);
                 let wanted = settings.map(|settings| wanted::check(settings, &resolved, &mut self.faults));
                 let raw_write = device.raw_write.get().map(|spans| self.raw_write(spans, &resolved));
+                self.identities(name, &resolved, &devices);
                 devices.push(DeviceSettings {
                     name: name.0.clone(),
                     title: device.name.clone().unwrap_or_else(|| title(&name.0)),
@@ -310,6 +312,26 @@ impl Resolver<'_> {
             }
         }
         spans().map(|span| span.value).collect()
+    }
+
+    /// What Home Assistant knows a point by is made of the device's name and the point's: `a` with `b_c` is
+    /// `a_b` with `c` to it, and of two with one identity it refuses the second.
+    fn identities(&mut self, name: &At<Name>, device: &Device, others: &[DeviceSettings]) {
+        for other in others {
+            let (own, others_own) = (name.0.as_str(), other.name.as_str());
+            let same = match (within(own, others_own), within(others_own, own)) {
+                (Some(rest), _) => shared_name(rest, device, &other.device),
+                (_, Some(rest)) => shared_name(rest, &other.device, device).map(|(a, b)| (b, a)),
+                _ => None,
+            };
+            if let Some((point, others_point)) = same {
+                let message = format!(
+                    "`{own}` with its point `{point}` and `{others_own}` with its point `{others_point}` are both \
+                     `{own}_{point}` to Home Assistant; give one of the devices another name"
+                );
+                self.faults.add(&name.place, message);
+            }
+        }
     }
 
     fn device_name(&mut self, name: &At<Name>, file: &Configuration) {
@@ -406,6 +428,15 @@ impl Resolver<'_> {
             home_assistant: file.home_assistant.as_ref().map(|looks| &looks.node),
         };
         let device = profile::load_inline(&inline, self.library, &mut self.faults)?;
+        for point in &device.points {
+            let unit = points.0.get(&point.name).and_then(|point| point.get("unit"));
+            let place = unit.map_or(points.0.named_at(), |unit| &unit.place);
+            for form in wishes::forms(point) {
+                if let device::Unit::Fixed(unit) = &form.unit {
+                    wishes::hint_at_unit(&point.name, unit, place, &mut self.warnings);
+                }
+            }
+        }
         if let Some(looks) = &file.home_assistant {
             wishes::check_release(&device, self.release, looks.node.named_at(), &mut self.faults);
         }
@@ -432,6 +463,24 @@ impl Resolver<'_> {
             self.faults.add(&found.place, format!("{value} is out of range; expected {least} to {most}"));
         }
     }
+}
+
+/// What stands in `long` behind `short` and a `_`.
+fn within<'n>(long: &'n str, short: &str) -> Option<&'n str> {
+    long.strip_prefix(short)?.strip_prefix('_')
+}
+
+/// The first point or thing of `long` that with `rest` in front is called as one of `short`, and that one.
+fn shared_name(rest: &str, long: &Device, short: &Device) -> Option<(String, String)> {
+    fn names(device: &Device) -> impl Iterator<Item = &str> {
+        let points = device.points.iter().map(|point| &*point.name);
+        points.chain(device.things.iter().map(|thing| &*thing.name))
+    }
+    let taken: BTreeSet<&str> = names(short).collect();
+    names(long)
+        .map(|name| (name, format!("{rest}_{name}")))
+        .find(|(_, whole)| taken.contains(whole.as_str()))
+        .map(|(name, whole)| (name.to_string(), whole))
 }
 
 /// Many devices of one profile are kept once. Of those that wish something of their own there may be as

@@ -69,6 +69,7 @@ fn apply_one(
     }
     if let Some(unit) = &wish.unit {
         give_unit(point, unit, faults);
+        hint_at_unit(&point.name, unit, &unit.place, warnings);
     }
     if let Some(deadband) = &wish.deadband {
         if !forms(point).any(is_number) {
@@ -93,7 +94,7 @@ fn apply_one(
         }
     }
     apply_look(&mut point.presentation, look);
-    check_presentation(point, wish, faults);
+    check_presentation(point, wish, faults, warnings);
 }
 
 /// A thing is made of points: only how it looks is a matter of wishes.
@@ -237,7 +238,7 @@ fn give_unit(point: &mut Point, unit: &At<String>, faults: &mut Faults) {
 }
 
 /// What Home Assistant would refuse, it refuses silently for the person who wished it; so here.
-fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults) {
+fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults, warnings: &mut Faults) {
     let look = &wish.presentation;
     let classes = [&look.device_class, &look.state_class, &wish.unit].into_iter().flatten();
     let place = classes.map(|class| &class.place).next();
@@ -270,6 +271,29 @@ fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults) {
             faults.add(place, message);
             return;
         }
+        let needed =
+            || units::needed_by(class?).filter(|_| matches!(form.unit, Unit::None) && is_number(form));
+        if let (Some(wished), Some(needed)) = (&look.device_class, needed()) {
+            let message = format!(
+                "device class `{}` without a unit: Home Assistant makes nothing of such a number; expected `unit` \
+                 beside it, one of {needed}",
+                wished.value
+            );
+            warnings.add(&wished.place, message);
+            return;
+        }
+    }
+}
+
+/// Home Assistant takes any unit; one that it would know by another spelling is most likely meant so.
+pub fn hint_at_unit(name: &str, unit: &str, place: &Place, warnings: &mut Faults) {
+    let meant: Vec<String> = units::meant_by(unit).iter().map(|meant| format!("`{meant}`")).collect();
+    if !meant.is_empty() {
+        let message = format!(
+            "Home Assistant does not know the unit `{unit}` of `{name}`; did you mean {}?",
+            meant.join(" or ")
+        );
+        warnings.add(place, message);
     }
 }
 
@@ -299,7 +323,7 @@ fn check_release_of(point: &Point, release: Release, place: &Place, faults: &mut
     }
 }
 
-fn forms(point: &Point) -> impl Iterator<Item = &Form> {
+pub fn forms(point: &Point) -> impl Iterator<Item = &Form> {
     let (plain, cases) = match &point.encoding {
         Encoding::Plain(form) => (Some(form), [].as_slice()),
         Encoding::Cases { cases, .. } => (None, cases.as_slice()),

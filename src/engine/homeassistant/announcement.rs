@@ -168,8 +168,8 @@ impl Outline {
 }
 
 /// What must be said before `next` when `previous` was announced: a component that is merely left
-/// out stays in Home Assistant as an orphan. `None` if nothing is dropped. Not retained, since the
-/// topic keeps what `next` says.
+/// out stays in Home Assistant as an orphan, and so does one that is another platform from now on. `None` if
+/// nothing is dropped. Not retained, since the topic keeps what `next` says.
 pub fn farewell(previous: &Announcement, next: &Announcement) -> Option<Message> {
     farewell_to(previous.components(), next)
 }
@@ -179,7 +179,9 @@ fn farewell_to<'p>(
     next: &Announcement,
 ) -> Option<Message> {
     let kept: BTreeMap<&str, &str> = next.components().collect();
-    let gone: Vec<(&str, &str)> = previous.filter(|(key, _)| !kept.contains_key(key)).collect();
+    // The tombstone of one that changes its platform stands in its own place, and `next` brings it back.
+    let gone: Vec<(&str, &str)> =
+        previous.filter(|(key, platform)| kept.get(key) != Some(platform)).collect();
     if gone.is_empty() {
         return None;
     }
@@ -483,6 +485,20 @@ mod tests {
 
         let message = farewell(&announced(Some(1)), &announced(Some(2))).expect("V is dropped");
         assert_eq!(payload(&message)["components"]["input_v"], json!({"platform": "sensor"}));
+    }
+
+    #[test]
+    fn what_becomes_another_platform_is_buried_before_it_comes_back_under_its_key() {
+        let as_sensor = announced(Some(0));
+        let mut as_number = as_sensor.clone();
+        let input = as_number.components.iter_mut().find(|(key, _)| key == "input_c").expect("the input");
+        input.1.insert("platform".into(), "number".into());
+        let known = Outline::of(&as_sensor, &as_sensor.message());
+        for message in [farewell(&as_sensor, &as_number), known.farewell(&as_number)] {
+            let components = payload(&message.expect("the sensor is dropped"))["components"].clone();
+            assert_eq!(components["input_c"], json!({"platform": "sensor"}));
+            assert_eq!(components["relay"]["platform"], "switch");
+        }
     }
 
     #[test]

@@ -5,6 +5,10 @@
 //! beyond, without a word to anybody, and a Home Assistant takes some hundred a second. When a gateway with
 //! many points came back, what was dropped could be that it is online. So a fixed pace that such a reader
 //! keeps up with, with a burst that fits in its queue many times.
+//!
+//! Outcomes and responses answer messages that came through the same broker just before, as fast as they came.
+//! Held to that pace a flood of commands would have to wait for minutes, and values behind it; so there may
+//! be more of them, a burst of which still fits.
 
 use crate::engine::time::{Duration, Time};
 
@@ -12,9 +16,12 @@ use crate::engine::time::{Duration, Time};
 pub(super) const AT_ONCE: usize = 100;
 pub(super) const PERIOD: Duration = Duration::from_millis(200);
 
+/// An answer is worth this part of another message.
+pub(super) const ANSWERS_FOR_ONE: usize = 8;
+
 #[derive(Clone, Debug, Default)]
 pub(super) struct Pace {
-    /// When the present period began, and how many messages were told in it.
+    /// When the present period began, and how many messages were told in it, counted as answers.
     period_began: Time,
     told: usize,
 }
@@ -25,20 +32,24 @@ impl Pace {
         if now >= self.period_began + PERIOD {
             (self.period_began, self.told) = (now, 0);
         }
-        self.told < AT_ONCE
+        self.told < AT_ONCE * ANSWERS_FOR_ONE
     }
 
-    pub(super) fn told(&mut self) {
-        self.told += 1;
+    pub(super) fn told(&mut self, is_answer: bool) {
+        self.told += weight(is_answer);
     }
 
     /// What was told last was not told after all.
-    pub(super) fn take_back(&mut self) {
-        self.told = self.told.saturating_sub(1);
+    pub(super) fn take_back(&mut self, is_answer: bool) {
+        self.told = self.told.saturating_sub(weight(is_answer));
     }
 
     /// Until when no more may be told, if too many have been.
     pub(super) fn held_until(&self) -> Option<Time> {
-        (self.told >= AT_ONCE).then(|| self.period_began + PERIOD)
+        (self.told >= AT_ONCE * ANSWERS_FOR_ONE).then(|| self.period_began + PERIOD)
     }
+}
+
+const fn weight(is_answer: bool) -> usize {
+    if is_answer { 1 } else { ANSWERS_FOR_ONE }
 }

@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use crate::engine::topics::Message;
 
-/// Messages told once that may wait; more push out the oldest. A slider that is dragged has a thousand outcomes
-/// in a moment, and each of them is told.
-pub(super) const ONCE_MAX: usize = 2000;
+/// Messages told once that may wait; more push out the oldest. A script that has lost its way gives thousands of
+/// commands in a moment, and the outcome of each is told.
+pub(super) const ONCE_MAX: usize = 5000;
 
 /// The empty queue keeps room for so many.
 const KEPT: usize = 1024;

@@ -303,8 +303,10 @@ pub fn list_of_choices(found: &str, choices: &[&str]) -> String {
 /// The choice that differs from `found` by a slip of the fingers: one letter in three at most.
 pub fn nearest<'a>(found: &str, choices: &[&'a str]) -> Option<&'a str> {
     let allowed = found.chars().count().max(2) / 3 + usize::from(found.chars().count() == 2);
+    let is_far = |choice: &str| found.len().abs_diff(choice.len()) > 4 * allowed;
     choices
         .iter()
+        .filter(|choice| !is_far(choice))
         .map(|choice| (distance(found, choice), *choice))
         .filter(|(distance, _)| *distance <= allowed)
         .min_by_key(|(distance, _)| *distance)

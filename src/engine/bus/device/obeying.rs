@@ -15,6 +15,13 @@ impl DeviceState {
         point.or_else(|| device.things.iter().position(|thing| thing.name == name).map(Target::Thing))
     }
 
+    /// What a message on a `set` topic may name.
+    pub(in crate::engine::bus) fn names_to_set(&self) -> Vec<&str> {
+        let device = &self.settings.device;
+        let points = device.points.iter().filter(|point| point.write.is_some());
+        points.map(|point| &*point.name).chain(device.things.iter().map(|thing| &*thing.name)).collect()
+    }
+
     pub(in crate::engine::bus) fn name_of(&self, target: Target) -> &str {
         match target {
             Target::Point(point) | Target::Setting(point) => &self.settings.device.points[point].name,

@@ -123,14 +123,14 @@ impl DeviceState {
             unit: self.unit_of(index),
             missing,
             read_at: self.values.read_at(index),
-            good_for: self.period_of(point).map(good_for),
+            good_for: self.period_of(point.poll).map(good_for),
             ..told
         }
     }
 
-    fn period_of(&self, point: &Point) -> Option<Duration> {
+    pub(super) fn period_of(&self, poll: Poll) -> Option<Duration> {
         let intervals = self.settings.device.wire.intervals;
-        match point.poll {
+        match poll {
             Poll::Fast => Some(intervals.fast),
             Poll::Slow => Some(intervals.slow),
             Poll::Once | Poll::Never => None,

@@ -4,10 +4,10 @@
 use serde_json::json;
 
 use crate::engine::codec;
-use crate::engine::device::{PointIndex, Thing};
+use crate::engine::device::{PointIndex, Poll, Thing};
 use crate::engine::health::drift_json;
 use crate::engine::homeassistant::{self, Announcement, Outline};
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 use crate::engine::topics::{Message, OFFLINE, ONLINE};
 use crate::engine::value::{Missing, Reading};
 
@@ -36,11 +36,30 @@ impl DeviceState {
         }
         let anyway = self.tell_anyway.contains(&point);
         self.tell_anyway.retain(|other| *other != point);
-        if let Some(text) = self.values.tell(now, point, details, context.republish, anyway) {
+        let again = self.told_again_after(details.poll, context.republish);
+        if !anyway && !self.values.may_be_told(now, point, again) {
+            return;
+        }
+        let before = self.values.told(point).map(Reading::to_string);
+        if let Some(text) = self.values.tell(now, point, details, again, anyway) {
+            if before.as_ref() == Some(&text) {
+                self.whole.is_told_again(now, context.republish);
+            } else {
+                self.whole.has_changed();
+            }
             let topic = context.topics_of(&self.settings.name).state(&details.name);
             context.publish(Message::retained(topic, text));
-            self.whole.has_changed();
         }
+    }
+
+    /// After which time what has not changed is told again. It is told when it is read: where the next reading
+    /// would be too late for `republish`, this one is the time.
+    pub(super) fn told_again_after(&self, poll: Poll, republish: Duration) -> Duration {
+        let early = |period: Duration| {
+            let latest = republish.as_micros().saturating_sub(period.as_micros()) as u64;
+            Duration::from_micros(latest + 1).min(republish)
+        };
+        self.period_of(poll).map_or(republish, early)
     }
 
     /// What things are follows from what their points say.
@@ -53,10 +72,14 @@ impl DeviceState {
             let told = &mut self.told_things[index];
             let is_told = |(before, at): &(String, Time)| before == text && now - *at < context.republish;
             if !told.as_ref().is_some_and(is_told) {
+                if told.as_ref().is_some_and(|(before, _)| before == text) {
+                    self.whole.is_told_again(now, context.republish);
+                } else {
+                    self.whole.has_changed();
+                }
                 *told = Some((text.to_string(), now));
                 let topic = context.topics_of(&self.settings.name).state(&thing.name);
                 context.publish(Message::retained(topic, text));
-                self.whole.has_changed();
             }
         }
     }

@@ -15,12 +15,19 @@ const INTERVAL: Duration = Duration::from_secs(1);
 pub(super) struct Whole {
     changed: bool,
     not_before: Time,
+    told_at: Time,
 }
 
 impl Whole {
     /// Something of it has been told on its own topic.
     pub(super) fn has_changed(&mut self) {
         self.changed = true;
+    }
+
+    /// The same as before has been told on its own topic, since it was told long ago: each of many points at a
+    /// time of its own, and this message once.
+    pub(super) fn is_told_again(&mut self, now: Time, republish: Duration) {
+        self.changed |= now - self.told_at + INTERVAL >= republish;
     }
 }
 
@@ -35,7 +42,7 @@ impl DeviceState {
         if self.whole_due_at().is_none_or(|due| now < due) {
             return;
         }
-        self.whole = Whole { changed: false, not_before: now + INTERVAL };
+        self.whole = Whole { changed: false, not_before: now + INTERVAL, told_at: now };
         let topics = context.topics_of(&self.settings.name);
         context.publish(Message::retained(topics.json(), self.whole_json()));
     }

@@ -145,6 +145,9 @@ fn taken_by_the_gateway(name: &str) -> Option<&'static str> {
     match name {
         "availability" | "info" | "health" => Some("is a topic of every device"),
         "eeprom_writes" => Some("is the entity that counts what is written to the device's EEPROM"),
+        _ if name.starts_with("wire_") => {
+            Some("begins as entities do that tell how the device is on its wire")
+        }
         _ => None,
     }
 }
