@@ -196,6 +196,7 @@ impl Soak {
             );
             checked += 1;
         }
+        assert!(self.world.collisions > 20, "{} collisions", self.world.collisions);
         assert!(checked > 10_000 && unknown > 500, "{checked} checked, {unknown} without a value");
     }
 

@@ -425,9 +425,21 @@ impl DeviceState {
         }
     }
 
+    /// How long its last request could have waited, had it not been a probe.
+    pub(super) fn full_timeout(&self) -> Duration {
+        self.full_timeout
+    }
+
     /// Whether the request that ends now only asked whether it is there again.
     pub(super) fn is_probed(&self) -> bool {
         self.patience.is_probing()
+    }
+
+    /// Something was heard that may be its late answer to a probe.
+    pub(super) fn shows_sign(&mut self, now: Time) {
+        if self.presence != Presence::Present && self.patience.shows_sign() {
+            self.paused_until = self.paused_until.min(now);
+        }
     }
 
     /// The line was left alone for so long because this device did not answer a probe: that counts in its

@@ -35,6 +35,8 @@ pub(super) struct Line {
     others: VecDeque<(Time, u8)>,
     /// The log has been told of another master.
     told: bool,
+    /// The last probe that was in vain: which device's, and until when a late answer to it may come.
+    probed: Option<(usize, Time)>,
 }
 
 impl Line {
@@ -87,6 +89,41 @@ impl Bus {
             None => (Severity::Info, "no other master has spoken for a minute".into()),
         };
         self.context.say(severity, format!("bus {}: {text}", self.name));
+    }
+
+    /// Whether a silent device is back, and only slower than a probe waits: its late answer is heard, or it
+    /// meets what another one says, and spoils that.
+    pub(super) fn look_for_signs(&mut self, asked: Option<usize>, reply: &Reply) {
+        let now = self.now;
+        if let Some(late) = reply.discarded.late {
+            let devices = self.devices.iter_mut().filter(|device| device.unit() == late.unit);
+            devices.for_each(|device| device.shows_sign(now));
+        }
+        let Some(asked) = asked else { return };
+        if self.devices[asked].is_probed() {
+            if reply.result == Err(RequestError::Timeout) {
+                self.line.probed = Some((asked, reply.sent_at + self.devices[asked].full_timeout() * 2));
+            }
+            return;
+        }
+        let is_line = !matches!(self.link, Link::Tcp { .. });
+        let Some((silent, _)) = self.line.probed.filter(|(_, until)| is_line && reply.sent_at < *until)
+        else {
+            return;
+        };
+        let is_spoilt = match &reply.result {
+            Ok(_) | Err(RequestError::Exception(_)) => reply.discarded.noise_bytes > 0,
+            Err(RequestError::Link(_) | RequestError::Impossible(_)) => false,
+            Err(_) => true,
+        };
+        if is_spoilt {
+            self.devices[silent].shows_sign(now);
+        }
+    }
+
+    /// Devices have got other numbers.
+    pub(super) fn forget_probe(&mut self) {
+        self.line.probed = None;
     }
 
     /// Asks a read that has collided again, after whatever may still come for it; returns the request if

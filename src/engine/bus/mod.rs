@@ -469,6 +469,7 @@ impl Bus {
                 if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
         }
         self.look_for_others(&reply);
+        self.look_for_signs(in_flight.device, &reply);
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         self.request_ended(in_flight, reply.result);
         self.renew_silent_connection();

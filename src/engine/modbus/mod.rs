@@ -17,7 +17,7 @@ pub mod guard;
 use std::fmt;
 
 use crate::engine::address::Span;
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 
 /// One question to one unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -232,6 +232,16 @@ pub struct Discarded {
     pub checksum_errors: u32,
     /// Whole requests that we did not send: another master's.
     pub requests_of_others: RequestsOfOthers,
+    /// Whose reply was late, the last one if there were several.
+    pub late: Option<LateReply>,
+}
+
+/// A reply that came after its request had been given up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LateReply {
+    pub unit: u8,
+    /// How long after the request had been sent.
+    pub after: Duration,
 }
 
 /// How many requests of another master were heard, and to which unit the last one was.

@@ -24,9 +24,9 @@ use std::collections::BTreeMap;
 
 use crate::engine::modbus::pdu;
 use crate::engine::modbus::rtu_bytes::{
-    Beginning, Unanswered, beginning, expected_length, frame, late_reply, sort,
+    Beginning, Sorted, Unanswered, beginning, expected_length, frame, late_reply, sort,
 };
-use crate::engine::modbus::{Answer, Discarded, Reply, Request, RequestError, RequestsOfOthers};
+use crate::engine::modbus::{Answer, Discarded, LateReply, Reply, Request, RequestError, RequestsOfOthers};
 use crate::engine::settings::Line;
 use crate::engine::time::{Duration, Time};
 
@@ -375,8 +375,8 @@ impl Guard {
     fn collided(&mut self, waiting: Waiting) -> Reply {
         let sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
         // What remained of our request is neither noise nor a damaged reply.
-        self.count(Discarded { noise_bytes: 0, checksum_errors: 0, ..sorted.discarded });
-        self.forget(&sorted.late);
+        let discarded = Discarded { noise_bytes: 0, checksum_errors: 0, ..sorted.discarded };
+        self.account(&Sorted { discarded, ..sorted });
         self.miss_echo();
         self.quarantine_until = Some(waiting.deadline);
         self.remember(&waiting, self.heard_at.last().copied().unwrap_or(waiting.deadline));
@@ -436,8 +436,9 @@ impl Guard {
     }
 
     fn remember(&mut self, waiting: &Waiting, at: Time) {
-        let due = waiting.transmitted_at + waiting.timeout;
-        self.unanswered.push(Unanswered { request: waiting.request.clone(), due, at });
+        let transmitted_at = waiting.transmitted_at;
+        let due = transmitted_at + waiting.timeout;
+        self.unanswered.push(Unanswered { request: waiting.request.clone(), transmitted_at, due, at });
     }
 
     /// Ends a request without an answer, with the error that what was heard amounts to.
@@ -464,8 +465,7 @@ impl Guard {
         if heard.echoes == 0 && self.echo == Echo::Yes {
             self.miss_echo();
         }
-        self.count(sorted.discarded);
-        self.forget(&sorted.late);
+        self.account(&sorted);
         let first = self.heard_at.first().copied();
         let last = self.heard_at.last().copied();
         self.clear(self.heard.len());
@@ -490,7 +490,7 @@ impl Guard {
         } else if !self.reply_looks_like_echo(&waiting) || too_late_for_an_echo {
             self.echo = Echo::No;
         }
-        self.count(sorted.discarded);
+        self.count(&sorted);
         // Units answer in order: no request gets a reply any more that is older than the one answered.
         // That may be an earlier write of the same; then this one still has its reply to come.
         let bytes = &self.heard[found.start..found.end];
@@ -521,8 +521,7 @@ impl Guard {
         let sorted = sort(&self.heard, &self.frame, None, &self.unanswered);
         // Nobody replies, so a copy of the request can only be an echo.
         self.echo = if sorted.discarded.echoes > 0 { Echo::Yes } else { Echo::No };
-        self.count(sorted.discarded);
-        self.forget(&sorted.late);
+        self.account(&sorted);
         self.clear(self.heard.len());
         self.state = State::Idle;
         Reply::new(Ok(Answer::Written), sent_at, None, &mut self.discarded)
@@ -554,8 +553,7 @@ impl Guard {
     /// Counts and drops the first `count` bytes, which answer nothing that is asked now.
     fn drop_strays(&mut self, count: usize) {
         let sorted = sort(&self.heard[..count], &[], None, &self.unanswered);
-        self.count(sorted.discarded);
-        self.forget(&sorted.late);
+        self.account(&sorted);
         self.clear(count);
     }
 
@@ -572,8 +570,21 @@ impl Guard {
         });
     }
 
-    fn count(&mut self, more: Discarded) {
+    /// Counts what was heard beside an answer. Those whose late replies are in it owe nothing more.
+    fn account(&mut self, sorted: &Sorted) {
+        self.count(sorted);
+        self.forget(&sorted.late);
+    }
+
+    /// Before anything of it is forgotten.
+    fn count(&mut self, sorted: &Sorted) {
+        let more = sorted.discarded;
         let sum = &mut self.discarded;
+        for (index, end) in sorted.late.iter().zip(&sorted.late_ends) {
+            let late = &self.unanswered[*index];
+            let after = self.heard_at[end - 1].since(late.transmitted_at);
+            sum.late = Some(LateReply { unit: late.request.unit, after });
+        }
         sum.noise_bytes += more.noise_bytes;
         sum.late_replies += more.late_replies;
         sum.foreign_frames += more.foreign_frames;

@@ -102,7 +102,7 @@ impl Scene {
     fn expect(&mut self, what: &str, result: Result<Answer, RequestError>) -> Discarded {
         let (reply, _) = self.reply();
         assert_eq!(reply.result, result, "{what}");
-        reply.discarded
+        Discarded { late: None, ..reply.discarded }
     }
 
     /// The line still works, and says what it is asked.
