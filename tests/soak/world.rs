@@ -116,6 +116,10 @@ impl World {
         requests.map(|(at, unit, _)| (*at, *unit)).collect()
     }
 
+    pub fn late_replies(&self) -> u64 {
+        self.bus.summary(self.now).counters.late_replies
+    }
+
     /// Lets time pass until `end`.
     pub fn run_until(&mut self, end: Time) {
         let mut steps_in_place = 0;

@@ -31,12 +31,15 @@ pub struct Request {
     /// Only asks whether a silent device is there again: without an answer in time the line does not
     /// wait for a late one, which unit, function and checksum tell apart from others'.
     pub is_probe: bool,
+    /// The unit may take so long, although it is known to be quicker and is not waited for as long. Without an
+    /// answer in time only this unit is left alone, until no late answer can come any more.
+    pub may_take: Option<Duration>,
 }
 
 impl Request {
     /// The request to a device that keeps to the specification.
     pub const fn new(unit: u8, call: Call) -> Request {
-        Request { unit, call, any_exception: false, is_probe: false }
+        Request { unit, call, any_exception: false, is_probe: false, may_take: None }
     }
 }
 

@@ -1,6 +1,6 @@
 //! How a silent device is asked: seldom and cheaply, and yet soon enough after its return.
 
-use crate::engine::time::Duration;
+use crate::engine::time::{Duration, Time};
 
 /// So many requests in a row without an answer, and a device counts as offline.
 pub(super) const FAILURES_UNTIL_OFFLINE: u32 = 3;
@@ -36,6 +36,14 @@ const FULL_PROBE_EACH: u32 = 512;
 /// Pauses differ by so many hundredths, so that two silent devices do not keep step.
 const JITTER_PERCENT: u32 = 3;
 
+/// A device that is there and is asked the usual is waited for so many times its slowest answer lately,
+const HURRIED_FACTOR: u32 = 4;
+/// but so long at least: the specification gives the slowest unit that time to carry out a broadcast (Modbus
+/// over serial line V1.02, 2.4.1), and an adapter may hold back bytes for some hundredths of a second.
+const HURRIED_SHORTEST: Duration = Duration::from_millis(200);
+/// The slowest answer is remembered for so long at least, and twice as long at most.
+const SLOWEST_KEPT: Duration = Duration::from_secs(30 * 60);
+
 /// What is known of a device's way to answer.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Patience {
@@ -43,6 +51,9 @@ pub(super) struct Patience {
     failures: u32,
     /// From sending a request to its answer's first byte; old ones fade.
     slowest_answer: Option<Duration>,
+    /// The slowest answer to a read, late ones too: since [`Patience::lately_since`], and in the time before it.
+    slowest_lately: [Duration; 2],
+    lately_since: Time,
     /// There is a sign that it is back: the next probe waits fully.
     is_expected: bool,
     /// Signs of its return that were none, since it last answered; and from how many failures on the next
@@ -60,6 +71,23 @@ impl Patience {
         self.start_anew();
         let faded = self.slowest_answer.map(|slowest| slowest * (FADING - 1) / FADING);
         self.slowest_answer = faded.max(latency);
+    }
+
+    /// A read was answered after this time, be it late.
+    pub(super) fn took(&mut self, now: Time, time: Duration) {
+        if now - self.lately_since >= SLOWEST_KEPT {
+            self.slowest_lately = [Duration::ZERO, self.slowest_lately[0]];
+            self.lately_since = now;
+        }
+        self.slowest_lately[0] = self.slowest_lately[0].max(time);
+    }
+
+    /// How long to wait for the answer to something that the device has often been asked of late. Who has just
+    /// left something unanswered is waited for fully.
+    pub(super) fn hurried_timeout(&self, full: Duration, demanded: Option<Duration>) -> Duration {
+        let [lately, before] = self.slowest_lately;
+        let short = (lately.max(before) * HURRIED_FACTOR).max(HURRIED_SHORTEST);
+        if self.failures == 0 { short.max(demanded.unwrap_or_default()).min(full) } else { full }
     }
 
     pub(super) fn unanswered(&mut self) {
@@ -205,6 +233,32 @@ mod tests {
         }
         // A slow one may cost more, but is not left alone for longer.
         assert!(cost(Some(150), 10, 100).1 <= Duration::from_secs(15));
+    }
+
+    #[test]
+    fn a_known_device_is_waited_for_four_times_its_slowest_answer_of_the_last_half_hour() {
+        let ms = Duration::from_millis;
+        for (slowest, demanded, expected) in
+            [(9, None, 200), (60, None, 240), (130, None, 500), (9, Some(300), 300), (9, Some(700), 500)]
+        {
+            let mut patience = silent(0, Some(9));
+            patience.took(Time::default(), ms(slowest));
+            assert_eq!(
+                patience.hurried_timeout(FULL, demanded.map(ms)),
+                ms(expected),
+                "{slowest} {demanded:?}"
+            );
+            // Who has just left something unanswered is waited for fully.
+            patience.unanswered();
+            assert_eq!(patience.hurried_timeout(FULL, demanded.map(ms)), FULL);
+        }
+        let mut patience = silent(0, Some(9));
+        let expected = |minutes: u64| if minutes < 65 { ms(400) } else { ms(200) };
+        patience.took(Time::from_millis(9 * 60_000), ms(100));
+        for minutes in [10, 35, 64, 65] {
+            patience.took(Time::from_millis(minutes * 60_000), ms(9));
+            assert_eq!(patience.hurried_timeout(FULL, None), expected(minutes), "{minutes}");
+        }
     }
 
     #[test]
