@@ -207,12 +207,13 @@ struct InFlight {
     gives_way: GivesWay,
 }
 
+/// To whom a request gives way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum GivesWay {
-    ToNobody,
-    ToCommands,
-    /// To commands and to what feeds a watchdog, as any poll.
-    ToFeeding,
+    Nobody,
+    Commands,
+    /// And commands, as any poll.
+    Feeding,
 }
 
 enum Purpose {

@@ -99,7 +99,7 @@ impl Bus {
         self.poll(device, polled);
         if let Some(in_flight) = &mut self.in_flight {
             in_flight.out_of_turn = false;
-            in_flight.gives_way = GivesWay::ToNobody;
+            in_flight.gives_way = GivesWay::Nobody;
         }
         true
     }
@@ -128,7 +128,7 @@ impl Bus {
         self.poll(device, self.devices[device].read_call(read));
         if let Some(in_flight) = &mut self.in_flight {
             in_flight.out_of_turn = true;
-            in_flight.gives_way = if late { GivesWay::ToNobody } else { GivesWay::ToCommands };
+            in_flight.gives_way = if late { GivesWay::Nobody } else { GivesWay::Commands };
         }
         true
     }
@@ -154,14 +154,14 @@ impl Bus {
     /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn, and no
     /// watchdog either. If it is on the wire, nobody has to ask again.
     pub(super) fn make_way(&mut self) {
-        let gives_way = self.in_flight.as_ref().map_or(GivesWay::ToNobody, |in_flight| in_flight.gives_way);
+        let gives_way = self.in_flight.as_ref().map_or(GivesWay::Nobody, |in_flight| in_flight.gives_way);
         let is_wanted = match gives_way {
-            GivesWay::ToNobody => false,
-            GivesWay::ToCommands => self.command_can_begin(),
-            GivesWay::ToFeeding => self.command_can_begin() || self.wants_to_feed(),
+            GivesWay::Nobody => false,
+            GivesWay::Commands => self.command_can_begin(),
+            GivesWay::Feeding => self.command_can_begin() || self.wants_to_feed(),
         };
         if let Some(in_flight) = self.in_flight.as_mut().filter(|_| is_wanted) {
-            in_flight.gives_way = GivesWay::ToNobody;
+            in_flight.gives_way = GivesWay::Nobody;
             self.context.actions.push_back(Action::Withdraw);
         }
     }
@@ -176,7 +176,7 @@ impl Bus {
 
     /// When the request that has begun should make way, if it can.
     pub(super) fn makes_way_at(&self) -> Option<Time> {
-        let gives_way = |in_flight: &InFlight| in_flight.gives_way == GivesWay::ToFeeding;
+        let gives_way = |in_flight: &InFlight| in_flight.gives_way == GivesWay::Feeding;
         if !self.feeds || !self.in_flight.as_ref().is_some_and(gives_way) {
             return None;
         }
@@ -223,7 +223,7 @@ impl Bus {
             commanded_at,
             out_of_turn: is_wish || (is_poll && before.was_wanted()),
             before: Some(before),
-            gives_way: if is_poll { GivesWay::ToFeeding } else { GivesWay::ToNobody },
+            gives_way: if is_poll { GivesWay::Feeding } else { GivesWay::Nobody },
         });
         self.ask(request, not_before, timeout);
     }
@@ -240,7 +240,7 @@ impl Bus {
             commanded_at: None,
             before: None,
             out_of_turn: false,
-            gives_way: GivesWay::ToNobody,
+            gives_way: GivesWay::Nobody,
         });
         self.ask(request, now, timeout);
     }
