@@ -32,6 +32,10 @@ struct Planned {
     wanted_now: bool,
     /// Has been asked in vain, and is due again whatever its period says.
     is_repeated: bool,
+    /// How often it has been answered since the device connected, as far as that is counted.
+    answers: u8,
+    /// In a row it has not been answered by a device that answered others meanwhile.
+    lost: u8,
     /// Has been answered since the device connected, if only with an exception.
     tried: bool,
     /// Answered with an exception: not asked again before.
@@ -45,6 +49,12 @@ struct Planned {
 /// For so long what nobody has answered waits behind everything that is overdue; on a bus that is never
 /// done with that its turn comes nevertheless.
 const REPEATED_BEHIND: Duration = Duration::from_secs(2);
+
+/// A read that comes at least so often, and has been answered so often since its device connected, holds no
+/// surprise any more. After one that was not answered it takes a few more.
+const PERIOD_WELL_KNOWN: Duration = Duration::from_secs(10);
+const ANSWERS_WELL_KNOWN: u8 = 32;
+const ANSWERS_TO_FORGIVE: u8 = 8;
 
 /// Where a read stands in the schedule.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -140,6 +150,8 @@ impl Polls {
             real_period: None,
             wanted_now: true,
             is_repeated: false,
+            answers: 0,
+            lost: 0,
             tried: false,
             paused_until: Time::default(),
             is_refused: false,
@@ -265,6 +277,21 @@ impl Polls {
     pub fn end(&mut self, index: usize) {
         self.reads[index].tried = true;
         self.reads[index].is_refused = false;
+        self.reads[index].lost = 0;
+    }
+
+    /// The read has brought what it asks for: that is counted.
+    pub fn know_better(&mut self, index: usize) {
+        let planned = &mut self.reads[index];
+        planned.answers = (planned.answers + 1).min(ANSWERS_WELL_KNOWN);
+    }
+
+    /// Whether the read comes so often, and has been answered so often, that nobody need wait for it much
+    /// longer than it took.
+    pub fn is_well_known(&self, index: usize) -> bool {
+        let planned = &self.reads[index];
+        let is_frequent = planned.period.is_some_and(|period| period <= PERIOD_WELL_KNOWN);
+        is_frequent && planned.answers >= ANSWERS_WELL_KNOWN
     }
 
     /// Nothing came of the read: it is wanted as before.
@@ -274,11 +301,18 @@ impl Polls {
 
     /// Nobody answered the read, for the moment: it is due at once, but goes before nothing that is more
     /// overdue. A device that dies must not keep the line from all others until it counts as dead.
-    pub fn try_again(&mut self, index: usize, now: Time) {
+    ///
+    /// If `others_are_answered` by that device, and only this read never, something may be in step with it:
+    /// then it is the next that is asked, after two, four, eight … times in vain. So seldom that one which is
+    /// never answered costs next to nothing.
+    pub fn try_again(&mut self, index: usize, now: Time, others_are_answered: bool) {
         let planned = &mut self.reads[index];
+        planned.answers = planned.answers.min(ANSWERS_WELL_KNOWN - ANSWERS_TO_FORGIVE);
+        planned.lost = if others_are_answered { planned.lost.checked_add(1).unwrap_or(128) } else { 0 };
+        let is_in_step = planned.lost >= 2 && planned.lost.is_power_of_two();
         match planned.period {
-            Some(_) => (planned.is_repeated, planned.began_at) = (true, Some(now)),
-            None => planned.wanted_now = true,
+            Some(_) if !is_in_step => (planned.is_repeated, planned.began_at) = (true, Some(now)),
+            _ => planned.wanted_now = true,
         }
     }
 
@@ -308,6 +342,8 @@ impl Polls {
         for planned in &mut self.reads {
             planned.wanted_now = true;
             planned.is_repeated = false;
+            planned.answers = 0;
+            planned.lost = 0;
             planned.tried = false;
             planned.paused_until = Time::default();
             planned.is_refused = false;
@@ -367,6 +403,8 @@ impl Polls {
                 planned.real_period = before.real_period;
                 planned.wanted_now = before.wanted_now;
                 planned.is_repeated = before.is_repeated;
+                planned.answers = before.answers;
+                planned.lost = before.lost;
                 planned.tried = before.tried;
                 planned.paused_until = before.paused_until;
                 planned.is_refused = before.is_refused;
@@ -513,7 +551,7 @@ mod tests {
         run(&mut polls, Duration::from_millis(5), Time::from_millis(5_000));
         let now = Time::from_millis(5_300);
         polls.begin(2, now, &mut Pace::default());
-        polls.try_again(2, now);
+        polls.try_again(2, now, false);
         assert_eq!(polls.due_at(), Some(Time::default()));
         // The others have waited for more than twice their period.
         let order: Vec<usize> = std::iter::from_fn(|| {
@@ -523,6 +561,47 @@ mod tests {
         })
         .collect();
         assert_eq!(order, [0, 1, 2]);
+    }
+
+    #[test]
+    fn a_read_that_is_lost_again_and_again_while_others_are_answered_now_and_then_goes_first() {
+        let mut polls = polls(&[Poll::Fast, Poll::Fast]);
+        run(&mut polls, Duration::from_millis(5), Time::from_millis(5_000));
+        let mut went_first = Vec::new();
+        for time in 1..=20 {
+            let now = Time::from_millis(5_000 + time * 300);
+            polls.begin(0, now, &mut Pace::default());
+            polls.try_again(0, now, true);
+            if polls.most_urgent(now) == Some((0, Urgency::Wanted)) {
+                went_first.push(time);
+            }
+        }
+        assert_eq!(went_first, [2, 4, 8, 16]);
+        // Once it is answered, all is as it was; and of a device that answers nothing, nothing goes first.
+        polls.end(0);
+        for time in 1..=4 {
+            let now = Time::from_millis(12_000 + time * 300);
+            polls.begin(0, now, &mut Pace::default());
+            polls.try_again(0, now, time == 1);
+            assert_ne!(polls.most_urgent(now), Some((0, Urgency::Wanted)));
+        }
+    }
+
+    #[test]
+    fn a_read_is_well_known_when_it_comes_often_and_has_been_answered_often() {
+        let mut polls = polls(&[Poll::Fast, Poll::Once]);
+        for answers in 1..=40 {
+            (0..2).for_each(|index| polls.know_better(index));
+            assert_eq!([0, 1].map(|index| polls.is_well_known(index)), [answers >= 32, false]);
+        }
+        polls.try_again(0, Time::default(), true);
+        let again = (1..).find(|_| {
+            polls.know_better(0);
+            polls.is_well_known(0)
+        });
+        assert_eq!(again, Some(8));
+        polls.want_all();
+        assert!(!polls.is_well_known(0));
     }
 
     #[test]

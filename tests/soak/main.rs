@@ -3,6 +3,7 @@
 
 mod dead_unit;
 mod device;
+mod losses;
 mod world;
 
 use std::collections::BTreeMap;
@@ -196,6 +197,7 @@ impl Soak {
             );
             checked += 1;
         }
+        assert!(self.world.collisions > 0, "{} collisions", self.world.collisions);
         assert!(checked > 10_000 && unknown > 500, "{checked} checked, {unknown} without a value");
     }
 

@@ -11,7 +11,7 @@ use busker::engine::topics::Message;
 use busker::simulator::Framing;
 use busker::simulator::line::{Line, Transmission};
 use busker::simulator::script;
-use busker::simulator::wire::Receiver;
+use busker::simulator::wire::{Receiver, character_time};
 
 pub struct World {
     pub now: Time,
@@ -34,6 +34,8 @@ pub struct World {
     pub published: Vec<Published>,
     /// What was on the line, to look at when something is wrong.
     frames: Vec<(Time, u8, String)>,
+    /// So often two spoke at the same time.
+    pub collisions: u32,
 }
 
 /// A message, and since when what it says may be true: since the request was sent that it answers.
@@ -41,6 +43,11 @@ pub struct Published {
     pub message: Message,
     pub at: Time,
     pub asked_at: [Time; 256],
+}
+
+/// What the line makes of characters that meet others.
+fn spoil(bytes: &mut [u8]) {
+    bytes.iter_mut().enumerate().for_each(|(index, byte)| *byte ^= 0x5A ^ (index as u8).wrapping_mul(29));
 }
 
 enum Port {
@@ -66,6 +73,7 @@ impl World {
             answered_at: [now; 256],
             published: Vec::new(),
             frames: Vec::new(),
+            collisions: 0,
         }
     }
 
@@ -108,6 +116,10 @@ impl World {
         requests.map(|(at, unit, _)| (*at, *unit)).collect()
     }
 
+    pub fn late_replies(&self) -> u64 {
+        self.bus.summary(self.now).counters.late_replies
+    }
+
     /// Lets time pass until `end`.
     pub fn run_until(&mut self, end: Time) {
         let mut steps_in_place = 0;
@@ -146,6 +158,9 @@ impl World {
                 let unit = usize::from(self.asked);
                 answer.at = answer.at.max(self.answered_at[unit] + Duration::from_millis(1));
                 self.answered_at[unit] = answer.at;
+                if self.meets_another(Some(self.asked), answer.at, answer.bytes.len()) {
+                    spoil(&mut answer.bytes);
+                }
                 self.coming.push((Some(self.asked), answer));
             }
         }
@@ -166,7 +181,12 @@ impl World {
         match self.to_send {
             Some(not_before) if now >= not_before.max(self.guard.earliest_send(now)) => {
                 self.to_send = None;
-                self.receiver.push(now, self.guard.frame());
+                let mut heard = self.guard.frame().to_vec();
+                let over_at = now + character_time(self.line.settings()) * heard.len() as u32;
+                if self.meets_another(None, over_at, heard.len()) {
+                    spoil(&mut heard);
+                }
+                self.receiver.push(now, &heard);
                 self.asked = self.guard.frame()[0];
                 self.asked_at[usize::from(self.asked)] = now;
                 let frame = format!("{now} -> {:02X?}", self.guard.frame());
@@ -183,6 +203,24 @@ impl World {
         if self.bus.wake_at().is_some_and(|at| at <= now) {
             self.tell(Event::Wake);
         }
+    }
+
+    /// Whether `count` characters that are over at `at` are on the line together with those of another unit,
+    /// which are spoilt by it.
+    fn meets_another(&mut self, sender: Option<u8>, at: Time, count: usize) -> bool {
+        let character = character_time(self.line.settings());
+        let begins = |at: Time, count: usize| Time(at.0 - (character * count as u32).as_micros() as u64);
+        let mut is_met = false;
+        for (other, coming) in &mut self.coming {
+            let is_other = other.is_some() && *other != sender;
+            let length = coming.bytes.len();
+            if is_other && begins(at, count) < coming.at && begins(coming.at, length) < at {
+                spoil(&mut coming.bytes);
+                is_met = true;
+            }
+        }
+        self.collisions += u32::from(is_met);
+        is_met
     }
 
     fn answered(&mut self, reply: Option<Reply>) {

@@ -42,6 +42,50 @@ fn a_watchdog_is_fed_in_time() {
     }
 }
 
+#[test]
+fn a_poll_that_waits_for_the_line_makes_way_for_a_heartbeat() {
+    let settings = devices::settings("device damper 1 damper.yaml\ndevice heating 2 thermometer\n");
+    let mut bus = Bus::new(Time::default(), &settings, 0, &Memories::default());
+    // The heartbeat is due each second.
+    let mut registers = BTreeMap::from([0, 1, 2, 3].map(|at| ((1, at), 1)));
+    registers.insert((1, 4), 30);
+    let mut now = Time::default();
+    bus.handle(now, Event::LinkUp);
+    loop {
+        let Some(request) = sent(&mut bus) else {
+            now = bus.wake_at().expect("polls without end").max(now);
+            bus.handle(now, Event::Wake);
+            continue;
+        };
+        if now > Time::from_millis(5_000) && request.unit == 2 {
+            break;
+        }
+        let sent_at = now;
+        now += TRANSACTION;
+        let answer = answer(&mut registers, &request);
+        let reply = Reply::new(Ok(answer), sent_at, Some((now, now)), &mut Discarded::default());
+        bus.handle(now, Event::Reply(reply));
+    }
+    // The line is noisy, and the poll not yet on it.
+    let until = now + Duration::from_secs(2);
+    while !std::iter::from_fn(|| bus.next_action()).any(|action| action == Action::Withdraw) {
+        now = bus.wake_at().filter(|at| *at > now && *at < until).expect("the heartbeat is due soon");
+        bus.handle(now, Event::Wake);
+    }
+    bus.handle(now, Event::Withdrawn);
+    let request = sent(&mut bus).expect("the heartbeat at once");
+    assert_eq!((request.unit, request.call.to_string()), (1, "read holding 1".into()));
+}
+
+/// What the bus asks next.
+fn sent(bus: &mut Bus) -> Option<Request> {
+    let actions: Vec<Action> = std::iter::from_fn(|| bus.next_action()).collect();
+    actions.into_iter().find_map(|action| match action {
+        Action::Send { request, .. } => Some(request),
+        _ => None,
+    })
+}
+
 /// A script that moves four sliders and never stops.
 fn move_sliders(bus: &mut Bus, now: Time) {
     let step = (now.0 / 20_000 % 2) as usize;
@@ -73,11 +117,7 @@ fn play(flood: Flood) -> Vec<(Time, u8, u16)> {
     let mut now = Time::default();
     bus.handle(now, Event::LinkUp);
     while now < MINUTE {
-        let actions: Vec<Action> = std::iter::from_fn(|| bus.next_action()).collect();
-        let sent = actions.into_iter().find_map(|action| match action {
-            Action::Send { request, .. } => Some(request),
-            _ => None,
-        });
+        let sent = sent(&mut bus);
         let sent_at = now;
         now += TRANSACTION;
         // Just before the answer is the worst time.

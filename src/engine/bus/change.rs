@@ -77,6 +77,7 @@ impl Bus {
         }
         self.active.iter_mut().for_each(|active| change(&mut active.device));
         self.forget_blame();
+        self.forget_given_up();
         self.settling.iter_mut().for_each(|settling| change(&mut settling.active.device));
         self.beat.iter_mut().for_each(|(device, ..)| change(device));
         self.waiting.iter_mut().for_each(|waiting| change(&mut waiting.device));

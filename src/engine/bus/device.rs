@@ -43,6 +43,10 @@ use withheld::{PAUSE_BUSY_LONG, Withheld};
 
 /// A device that is not the one that the profile describes is asked again after this.
 const PAUSE_MISMATCH: Duration = Duration::from_secs(30);
+/// After a write a device is waited for fully for so long,
+const BUSY_AFTER_WRITE: Duration = Duration::from_secs(5);
+/// and when it may have been slow, for so long.
+const SLOW_PERHAPS: Duration = Duration::from_secs(30);
 
 pub(super) struct DeviceState {
     settings: DeviceSettings,
@@ -62,6 +66,8 @@ pub(super) struct DeviceState {
     full_timeout: Duration,
     /// Nothing is asked before.
     paused_until: Time,
+    /// It may be slow until then: it has been written to, or seemed to be slow.
+    busy_until: Time,
     served_at: Time,
     last_answer_end: Time,
     last_answer_at: Option<Time>,
@@ -138,6 +144,7 @@ impl DeviceState {
             keeping: Keeping::default(),
             full_timeout: Duration::ZERO,
             paused_until: Time::default(),
+            busy_until: Time::default(),
             served_at: Time::default(),
             last_answer_end: Time::default(),
             last_answer_at: None,
@@ -310,16 +317,35 @@ impl DeviceState {
         now.max(self.rested_at())
     }
 
-    /// How long the next request may wait for its answer.
-    pub(super) fn timeout(&mut self, of_bus: Duration) -> Duration {
+    /// How long the next request may wait for its answer; less where it is known how quick that is, for the
+    /// reads of [`DeviceState::is_well_known`].
+    pub(super) fn timeout(&mut self, of_bus: Duration, is_well_known: bool) -> Duration {
         let demanded = self.settings.device.wire.response_timeout;
         self.full_timeout = demanded.unwrap_or(of_bus).max(of_bus);
-        self.patience.timeout(self.full_timeout, demanded)
+        match is_well_known && !self.patience.is_probing() {
+            true => self.patience.hurried_timeout(self.full_timeout, demanded),
+            false => self.patience.timeout(self.full_timeout, demanded),
+        }
     }
 
-    pub(super) fn request(&self, call: Call) -> Request {
-        let any_exception = self.settings.device.wire.quirks.exception_function_varies;
-        Request { unit: self.settings.unit, call, any_exception, is_probe: self.patience.is_probing() }
+    /// Whether it is known how long the device takes for this read. One that has just been written to may
+    /// still be busy with its EEPROM.
+    pub(super) fn is_well_known(&self, read: usize, now: Time) -> bool {
+        self.polls.is_well_known(read) && now >= self.busy_until
+    }
+
+    pub(super) fn request(&mut self, now: Time, call: Call, timeout: Duration) -> Request {
+        if call.is_write() {
+            self.busy_until = now + BUSY_AFTER_WRITE;
+        }
+        let is_probe = self.patience.is_probing();
+        Request {
+            unit: self.settings.unit,
+            call,
+            any_exception: self.settings.device.wire.quirks.exception_function_varies,
+            is_probe,
+            may_take: Some(self.full_timeout).filter(|full| !is_probe && timeout < *full),
+        }
     }
 
     /// The point is wanted now, and told even if it has not changed.
@@ -350,13 +376,17 @@ impl DeviceState {
         self.polls.want_all();
     }
 
-    pub(super) fn count(&mut self, now: Time, reply: &Reply) {
+    pub(super) fn count(&mut self, now: Time, reply: &Reply, is_read: bool) {
         self.counters.count_result(&reply.result);
         self.counters.count_discarded(reply.discarded);
         self.last_answer_end = reply.last_byte_at.unwrap_or(now);
         if matches!(reply.result, Ok(_) | Err(RequestError::Exception(_))) {
             self.last_answer_at = Some(now);
-            self.patience.answered(reply.first_byte_at.map(|first| first - reply.sent_at));
+            let latency = reply.first_byte_at.map(|first| first - reply.sent_at);
+            self.patience.answered(latency);
+            if let Some(latency) = latency.filter(|_| is_read) {
+                self.patience.took(now, latency);
+            }
         }
     }
 
@@ -443,9 +473,35 @@ impl DeviceState {
         }
     }
 
+    /// How long its last request could have waited, had it not been a probe.
+    pub(super) fn full_timeout(&self) -> Duration {
+        self.full_timeout
+    }
+
     /// Whether the request that ends now only asked whether it is there again.
     pub(super) fn is_probed(&self) -> bool {
         self.patience.is_probing()
+    }
+
+    /// Its answer to an earlier request was heard, so long after that.
+    pub(super) fn was_late(&mut self, now: Time, after: Duration) {
+        self.patience.took(now, after);
+        self.shows_sign(now);
+    }
+
+    /// A late answer may come until then.
+    pub(super) fn rest_until(&mut self, until: Time) {
+        self.paused_until = self.paused_until.max(until);
+    }
+
+    /// Something was heard that may be its late answer. One that is slow again while it is waited for fully
+    /// is known to be.
+    pub(super) fn shows_sign(&mut self, now: Time) {
+        if self.presence == Presence::Present {
+            self.busy_until = self.busy_until.max(now + SLOW_PERHAPS);
+        } else if self.patience.shows_sign() {
+            self.paused_until = self.paused_until.min(now);
+        }
     }
 
     /// The line was left alone for so long because this device did not answer a probe: that counts in its
@@ -473,6 +529,7 @@ impl DeviceState {
             Ok(answer) => {
                 self.polls.end(index);
                 self.given(index, context);
+                self.polls.know_better(index);
                 let read = self.polls.shared_read(index);
                 let words = match answer {
                     Answer::Words(words) => words,
@@ -492,7 +549,7 @@ impl DeviceState {
                     (
                         Presence::Present,
                         RequestError::Timeout | RequestError::Unreachable(_) | RequestError::Link(_),
-                    ) => self.polls.try_again(index, now),
+                    ) => self.polls.try_again(index, now, self.patience.failures() == 1),
                     // It is there, and only its answer was spoilt.
                     _ => self.polls.want_again(index),
                 }

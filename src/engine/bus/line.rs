@@ -7,12 +7,15 @@ use std::collections::VecDeque;
 
 use super::{Action, Bus, InFlight, Severity};
 use crate::engine::modbus::{Reply, Request, RequestError, RequestsOfOthers};
+use crate::engine::settings::Link;
 use crate::engine::time::{Duration, Time};
 
 /// So often a read that has collided is asked again before it counts as unanswered.
 const REPEATS_MAX: u32 = 3;
 /// The repetition comes at random within this time, or two masters that keep step would collide again.
 const SPREAD: Duration = Duration::from_millis(50);
+/// A read's request is on the wire for less, also at 1200 baud.
+const TRANSMITTING: Duration = Duration::from_millis(80);
 /// What was heard this long ago says nothing of now.
 const MEMORY: Duration = Duration::from_secs(60);
 /// Noise that happens to be a request is rare, and does not come twice in a minute.
@@ -32,6 +35,8 @@ pub(super) struct Line {
     others: VecDeque<(Time, u8)>,
     /// The log has been told of another master.
     told: bool,
+    /// The device that was last given up before its full time, and until when its late answer may come.
+    given_up: Option<(usize, Time)>,
 }
 
 impl Line {
@@ -86,6 +91,50 @@ impl Bus {
         self.context.say(severity, format!("bus {}: {text}", self.name));
     }
 
+    /// Whether a device that was not waited for fully is only slower than that: its late answer is heard, or
+    /// meets what another one says, and spoils it.
+    pub(super) fn look_for_signs(&mut self, asked: Option<usize>, reply: &Reply) {
+        let now = self.now;
+        if let Some(late) = reply.discarded.late {
+            let devices = self.devices.iter_mut().filter(|device| device.unit() == late.unit);
+            devices.for_each(|device| device.was_late(now, late.after));
+        }
+        let Some(asked) = asked.filter(|_| !matches!(self.link, Link::Tcp { .. })) else { return };
+        let is_probe = self.devices[asked].is_probed();
+        let is_spoilt = match &reply.result {
+            Ok(_) | Err(RequestError::Exception(_)) => reply.discarded.noise_bytes > 0,
+            Err(RequestError::Link(_) | RequestError::Impossible(_)) => false,
+            Err(_) => true,
+        };
+        if let Some((silent, until)) = self.line.given_up {
+            if is_spoilt && !is_probe && silent != asked && reply.sent_at < until {
+                self.devices[silent].shows_sign(now);
+            }
+        }
+        let is_hurried = self.line.asked.as_ref().is_some_and(|(request, _)| request.may_take.is_some());
+        if (is_probe || is_hurried) && reply.result == Err(RequestError::Timeout) {
+            let full = self.devices[asked].full_timeout();
+            self.line.given_up = Some((asked, reply.sent_at + if is_probe { full * 2 } else { full }));
+        }
+    }
+
+    /// Until when the device of the request that ends now is to be left alone, since it was not waited for as
+    /// long as it may take: as long as the line would be silent otherwise. At random a little longer, or what
+    /// disturbs the line at regular times might meet it again and again.
+    pub(super) fn rests_until(&self, reply: &Reply) -> Option<Time> {
+        let (request, timeout) = self.line.asked.as_ref()?;
+        let full = request.may_take?;
+        let is_unanswered = !matches!(reply.result, Ok(_) | Err(RequestError::Exception(_)));
+        // One that ended before its time is waited for by the line.
+        let is_over = is_unanswered && self.now - reply.sent_at >= *timeout;
+        is_over.then(|| reply.sent_at + full * 2 + TRANSMITTING + at_random(self.now, full / 2))
+    }
+
+    /// Devices have got other numbers.
+    pub(super) fn forget_given_up(&mut self) {
+        self.line.given_up = None;
+    }
+
     /// Asks a read that has collided again, after whatever may still come for it; returns the request if
     /// it has ended. A write is never repeated: who is at the other end of the line may have heard it whole,
     /// and its read-back tells what became of it.
@@ -103,17 +152,17 @@ impl Bus {
             return Some(in_flight);
         };
         self.line.collisions_in_a_row += 1;
-        let not_before = reply.sent_at + timeout + at_random(self.now);
+        let not_before = reply.sent_at + timeout + at_random(self.now, SPREAD);
         self.in_flight = Some(InFlight { sent_at: not_before, ..in_flight });
         self.ask(request, not_before, timeout);
         None
     }
 }
 
-/// A part of [`SPREAD`]: the middle of a product with a large odd number is as good as random.
-fn at_random(now: Time) -> Duration {
+/// A part of `spread`: the middle of a product with a large odd number is as good as random.
+fn at_random(now: Time, spread: Duration) -> Duration {
     let part = (now.0.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as u32 % 1000;
-    SPREAD * part / 1000
+    spread * part / 1000
 }
 
 #[cfg(test)]
@@ -153,7 +202,7 @@ mod tests {
 
     #[test]
     fn repetitions_are_spread() {
-        let spread: Vec<Duration> = (0..20).map(|index| at_random(Time(index * 37_411))).collect();
+        let spread: Vec<Duration> = (0..20).map(|index| at_random(Time(index * 37_411), SPREAD)).collect();
         assert!(spread.iter().all(|part| *part < SPREAD));
         assert!(spread.iter().min() < Some(&(SPREAD / 4)) && spread.iter().max() > Some(&(SPREAD * 3 / 4)));
     }

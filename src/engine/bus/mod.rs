@@ -206,8 +206,17 @@ struct InFlight {
     before: Option<Turn>,
     /// Somebody wants it at once, while others wait for their turn.
     out_of_turn: bool,
-    /// A command may take its turn.
-    gives_way: bool,
+    /// Who may take its turn while it is not on the wire.
+    gives_way: GivesWay,
+}
+
+/// To whom a request gives way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum GivesWay {
+    Nobody,
+    Commands,
+    /// And commands, as any poll.
+    Feeding,
 }
 
 enum Purpose {
@@ -299,7 +308,7 @@ impl Bus {
             Event::Recorded(request, result) => self.recorded(request, result),
             Event::BrokerUp => self.broker_up = true,
             Event::BrokerDown => self.broker_up = false,
-            Event::Wake => {}
+            Event::Wake => self.make_way(),
             Event::Shutdown => self.stopping = true,
         }
         self.end_retirements();
@@ -340,7 +349,8 @@ impl Bus {
         let wholes = tell_wholes.iter().filter_map(DeviceState::whole_due_at);
         let records = self.record_due_at.into_iter().chain(self.recorder.due_at()).chain(wholes);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
-            return records.chain(self.waiting.next_deadline()).chain(self.requests_expire_at()).min();
+            let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
+            return records.chain(expiring).chain(self.makes_way_at()).min();
         }
         if self.now < self.silent_until {
             let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
@@ -413,7 +423,7 @@ impl Bus {
         self.counters.count_discarded(reply.discarded);
         self.keep_time(&in_flight, &reply);
         if let Some(device) = in_flight.device {
-            self.devices[device].count(self.now, &reply);
+            self.devices[device].count(self.now, &reply, in_flight.reads.is_some());
             self.unanswered =
                 if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
         }
@@ -421,9 +431,14 @@ impl Bus {
             self.connection.answered(self.now);
         }
         self.look_for_others(&reply);
+        self.look_for_signs(in_flight.device, &reply);
+        let rests_until = in_flight.device.zip(self.rests_until(&reply));
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         self.renew_used_connection();
         self.request_ended(in_flight, reply.result);
+        if let Some((device, until)) = rests_until {
+            self.devices[device].rest_until(until);
+        }
         self.renew_silent_connection();
     }
 

@@ -7,9 +7,11 @@
 
 use crate::engine::address::Span;
 use crate::engine::modbus::{Call, Request};
+use crate::engine::settings::Link;
+use crate::engine::time::Time;
 
 use super::device::{DeviceState, Polled};
-use super::{Action, Bus, InFlight, LinkState, OnBrokerLoss, Purpose};
+use super::{Action, Bus, GivesWay, InFlight, LinkState, OnBrokerLoss, Purpose};
 
 /// So many requests in a row may go before a read that is due, because somebody wants them at once. Then
 /// the read has its turn: under a flood of commands every period stretches, but nothing starves.
@@ -100,7 +102,7 @@ impl Bus {
         self.poll(device, polled);
         if let Some(in_flight) = &mut self.in_flight {
             in_flight.out_of_turn = false;
-            in_flight.gives_way = false;
+            in_flight.gives_way = GivesWay::Nobody;
         }
         true
     }
@@ -129,7 +131,7 @@ impl Bus {
         self.poll(device, self.devices[device].read_call(read));
         if let Some(in_flight) = &mut self.in_flight {
             in_flight.out_of_turn = true;
-            in_flight.gives_way &= !late;
+            in_flight.gives_way = if late { GivesWay::Nobody } else { GivesWay::Commands };
         }
         true
     }
@@ -152,12 +154,37 @@ impl Bus {
         self.has_settings = self.devices.iter().any(DeviceState::has_settings);
     }
 
-    /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn.
+    /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn, and no
+    /// watchdog either. If it is on the wire, nobody has to ask again.
     pub(super) fn make_way(&mut self) {
-        let gives_way = |in_flight: &InFlight| in_flight.gives_way;
-        if self.in_flight.as_ref().is_some_and(gives_way) && self.command_can_begin() {
+        let gives_way = self.in_flight.as_ref().map_or(GivesWay::Nobody, |in_flight| in_flight.gives_way);
+        let is_wanted = match gives_way {
+            GivesWay::Nobody => false,
+            GivesWay::Commands => self.command_can_begin(),
+            GivesWay::Feeding => self.command_can_begin() || self.wants_to_feed(),
+        };
+        if let Some(in_flight) = self.in_flight.as_mut().filter(|_| is_wanted) {
+            in_flight.gives_way = GivesWay::Nobody;
             self.context.actions.push_back(Action::Withdraw);
         }
+    }
+
+    fn wants_to_feed(&self) -> bool {
+        let now = self.now;
+        let is_hungry = |device: &DeviceState| {
+            device.beat_due(now, false).is_some() || device.feed_due(now, false).is_some()
+        };
+        self.feeds && self.askable().any(|(_, device)| is_hungry(device))
+    }
+
+    /// When the request that has begun should make way, if it can.
+    pub(super) fn makes_way_at(&self) -> Option<Time> {
+        let gives_way = |in_flight: &InFlight| in_flight.gives_way == GivesWay::Feeding;
+        if !self.feeds || !self.in_flight.as_ref().is_some_and(gives_way) {
+            return None;
+        }
+        let beats = self.askable().filter_map(|(_, device)| device.beats_at());
+        beats.filter(|at| *at > self.now).min()
     }
 
     pub(super) fn withdrawn(&mut self) {
@@ -177,13 +204,19 @@ impl Bus {
         };
         let is_poll = matches!(purpose, Purpose::Poll { .. });
         let is_wish = matches!(purpose, Purpose::Command | Purpose::Fetch | Purpose::BeatRead(_));
-        let timeout = state.timeout(self.response_timeout);
+        // A network may hold up a packet for longer than any device takes.
+        let may_hurry = matches!(self.link, Link::Serial { .. });
+        let is_well_known = match purpose {
+            Purpose::Poll { read } => may_hurry && state.is_well_known(read, self.now),
+            _ => false,
+        };
+        let timeout = state.timeout(self.response_timeout, is_well_known);
         let not_before = state.asked(self.now);
         let commanded_at = match purpose {
             Purpose::Command => self.active.as_mut().and_then(|active| active.came_at.take()),
             _ => None,
         };
-        let request = state.request(call);
+        let request = state.request(self.now, call, timeout);
         self.in_flight = Some(InFlight {
             device: Some(device),
             purpose,
@@ -193,7 +226,7 @@ impl Bus {
             commanded_at,
             out_of_turn: is_wish || (is_poll && before.was_wanted()),
             before: Some(before),
-            gives_way: is_poll,
+            gives_way: if is_poll { GivesWay::Feeding } else { GivesWay::Nobody },
         });
         self.ask(request, not_before, timeout);
     }
@@ -210,7 +243,7 @@ impl Bus {
             commanded_at: None,
             before: None,
             out_of_turn: false,
-            gives_way: false,
+            gives_way: GivesWay::Nobody,
         });
         self.ask(request, now, timeout);
     }

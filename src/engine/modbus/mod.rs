@@ -17,7 +17,7 @@ pub mod guard;
 use std::fmt;
 
 use crate::engine::address::Span;
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 
 /// One question to one unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -31,12 +31,15 @@ pub struct Request {
     /// Only asks whether a silent device is there again: without an answer in time the line does not
     /// wait for a late one, which unit, function and checksum tell apart from others'.
     pub is_probe: bool,
+    /// The unit may take so long, although it is known to be quicker and is not waited for as long. Without an
+    /// answer in time only this unit is left alone, until no late answer can come any more.
+    pub may_take: Option<Duration>,
 }
 
 impl Request {
     /// The request to a device that keeps to the specification.
     pub const fn new(unit: u8, call: Call) -> Request {
-        Request { unit, call, any_exception: false, is_probe: false }
+        Request { unit, call, any_exception: false, is_probe: false, may_take: None }
     }
 }
 
@@ -232,6 +235,16 @@ pub struct Discarded {
     pub checksum_errors: u32,
     /// Whole requests that we did not send: another master's.
     pub requests_of_others: RequestsOfOthers,
+    /// Whose reply was late, the last one if there were several.
+    pub late: Option<LateReply>,
+}
+
+/// A reply that came after its request had been given up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LateReply {
+    pub unit: u8,
+    /// How long after the request had been sent.
+    pub after: Duration,
 }
 
 /// How many requests of another master were heard, and to which unit the last one was.

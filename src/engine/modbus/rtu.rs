@@ -7,6 +7,9 @@
 //! * After a request without an answer the line stays silent for a quarantine, in which a late
 //!   reply is dropped. It ends early when that reply comes. After a probe of a silent device it lasts
 //!   as long as that device's replies have come late before: for most not at all.
+//! * A unit that is known to be quick is waited for less. When its answer does not come, that unit alone is
+//!   left in peace for as long as its reply might be late after a full wait; others are asked meanwhile, since
+//!   a late reply says whose it is.
 //! * A unit that has been heard to answer late is waited for longer, within bounds: a timeout that is too
 //!   short makes itself known, and does no harm.
 //! * A reply later than the quarantine may meet the next request. If it differs in unit, function
@@ -24,9 +27,9 @@ use std::collections::BTreeMap;
 
 use crate::engine::modbus::pdu;
 use crate::engine::modbus::rtu_bytes::{
-    Beginning, Unanswered, beginning, expected_length, frame, late_reply, sort,
+    Beginning, Sorted, Unanswered, beginning, expected_length, frame, late_reply, sort,
 };
-use crate::engine::modbus::{Answer, Discarded, Reply, Request, RequestError, RequestsOfOthers};
+use crate::engine::modbus::{Answer, Discarded, LateReply, Reply, Request, RequestError, RequestsOfOthers};
 use crate::engine::settings::Line;
 use crate::engine::time::{Duration, Time};
 
@@ -79,6 +82,8 @@ pub struct Guard {
     /// When the last byte was on the wire, in either direction.
     busy_until: Option<Time>,
     quarantine_until: Option<Time>,
+    /// Units that are not asked before, although others are.
+    resting: BTreeMap<u8, Time>,
     unanswered: Vec<Unanswered>,
     /// How late each unit's latest reply came, behind the timeout that was asked for.
     lateness: BTreeMap<u8, Duration>,
@@ -138,6 +143,7 @@ impl Guard {
             echoes_missed: 0,
             busy_until: None,
             quarantine_until: None,
+            resting: BTreeMap::new(),
             unanswered: Vec::new(),
             lateness: BTreeMap::new(),
             discarded: Discarded::default(),
@@ -168,11 +174,11 @@ impl Guard {
     /// When the frame may be sent: after the quarantine and the silent gap. Ask again after each
     /// byte that comes before.
     pub fn earliest_send(&self, now: Time) -> Time {
-        let begun = match &self.state {
-            State::Begun { at, .. } => *at,
-            _ => now,
+        let (begun, rests_until) = match &self.state {
+            State::Begun { request, at, .. } => (*at, self.resting.get(&request.unit).copied()),
+            _ => (now, None),
         };
-        let quarantine = self.quarantine_until.unwrap_or(begun);
+        let quarantine = self.quarantine_until.max(rests_until).unwrap_or(begun);
         let silent = self.busy_until.map_or(begun, |busy| busy + self.gap);
         silent.min(begun.max(quarantine) + PATIENCE).max(quarantine)
     }
@@ -189,6 +195,7 @@ impl Guard {
         };
         self.drop_strays(self.heard.len());
         self.quarantine_until = None;
+        self.resting.remove(&request.unit);
         let transmitted_at = now + self.delay_before_send + self.line.characters(self.frame.len() as u32);
         self.busy_until = Some(transmitted_at);
         let wait =
@@ -275,6 +282,7 @@ impl Guard {
         let state = std::mem::replace(&mut self.state, State::Idle);
         self.drop_strays(self.heard.len());
         self.unanswered.clear();
+        self.resting.clear();
         self.quarantine_until = None;
         self.busy_until = None;
         self.echo = Echo::Unknown;
@@ -375,14 +383,22 @@ impl Guard {
     fn collided(&mut self, waiting: Waiting) -> Reply {
         let sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
         // What remained of our request is neither noise nor a damaged reply.
-        self.count(Discarded { noise_bytes: 0, checksum_errors: 0, ..sorted.discarded });
-        self.forget(&sorted.late);
+        let discarded = Discarded { noise_bytes: 0, checksum_errors: 0, ..sorted.discarded };
+        self.account(&Sorted { discarded, ..sorted });
         self.miss_echo();
-        self.quarantine_until = Some(waiting.deadline);
-        self.remember(&waiting, self.heard_at.last().copied().unwrap_or(waiting.deadline));
+        self.await_reply(&waiting);
         self.clear(self.heard.len());
         self.state = State::Idle;
         Reply::new(Err(RequestError::Collision), waiting.sent_at, None, &mut self.discarded)
+    }
+
+    /// What was heard ended the request before its time: until then its reply may come.
+    fn await_reply(&mut self, waiting: &Waiting) {
+        self.quarantine_until = Some(waiting.deadline);
+        if let Some(full) = waiting.request.may_take {
+            self.resting.insert(waiting.request.unit, waiting.transmitted_at + full);
+        }
+        self.remember(waiting, self.heard_at.last().copied().unwrap_or(waiting.deadline));
     }
 
     fn miss_echo(&mut self) {
@@ -406,8 +422,7 @@ impl Guard {
         }
         // The reply may have been something else that only looked like it, unless it was all there.
         if Some(sorted.damaged) != expected || echo_possible {
-            self.quarantine_until = Some(waiting.deadline);
-            self.remember(waiting, self.heard_at.last().copied().unwrap_or(waiting.deadline));
+            self.await_reply(waiting);
         }
         Some(self.failed(waiting.clone(), true))
     }
@@ -417,12 +432,17 @@ impl Guard {
         let reply = self.failed(waiting.clone(), false);
         let unit = waiting.request.unit;
         let lateness = self.lateness.get(&unit).copied().unwrap_or_default();
-        let quarantine = match waiting.request.is_probe {
-            true => {
+        let quarantine = match (waiting.request.is_probe, waiting.request.may_take) {
+            // Others are asked meanwhile: a late reply is known by its unit.
+            (_, Some(full)) => {
+                self.resting.insert(unit, waiting.transmitted_at + full * 2);
+                Duration::ZERO
+            }
+            (true, None) => {
                 let late = (lateness * 2).saturating_sub(self.more_time(unit, waiting.timeout));
                 late.min(QUARANTINE_AFTER_PROBE_MAX)
             }
-            false => self.quarantine.unwrap_or(waiting.timeout),
+            (false, None) => self.quarantine.unwrap_or(waiting.timeout),
         };
         self.quarantine_until = Some(now + quarantine);
         self.remember(&waiting, now);
@@ -436,8 +456,9 @@ impl Guard {
     }
 
     fn remember(&mut self, waiting: &Waiting, at: Time) {
-        let due = waiting.transmitted_at + waiting.timeout;
-        self.unanswered.push(Unanswered { request: waiting.request.clone(), due, at });
+        let transmitted_at = waiting.transmitted_at;
+        let due = transmitted_at + waiting.request.may_take.unwrap_or(waiting.timeout);
+        self.unanswered.push(Unanswered { request: waiting.request.clone(), transmitted_at, due, at });
     }
 
     /// Ends a request without an answer, with the error that what was heard amounts to.
@@ -464,8 +485,7 @@ impl Guard {
         if heard.echoes == 0 && self.echo == Echo::Yes {
             self.miss_echo();
         }
-        self.count(sorted.discarded);
-        self.forget(&sorted.late);
+        self.account(&sorted);
         let first = self.heard_at.first().copied();
         let last = self.heard_at.last().copied();
         self.clear(self.heard.len());
@@ -490,7 +510,7 @@ impl Guard {
         } else if !self.reply_looks_like_echo(&waiting) || too_late_for_an_echo {
             self.echo = Echo::No;
         }
-        self.count(sorted.discarded);
+        self.count(&sorted);
         // Units answer in order: no request gets a reply any more that is older than the one answered.
         // That may be an earlier write of the same; then this one still has its reply to come.
         let bytes = &self.heard[found.start..found.end];
@@ -521,8 +541,7 @@ impl Guard {
         let sorted = sort(&self.heard, &self.frame, None, &self.unanswered);
         // Nobody replies, so a copy of the request can only be an echo.
         self.echo = if sorted.discarded.echoes > 0 { Echo::Yes } else { Echo::No };
-        self.count(sorted.discarded);
-        self.forget(&sorted.late);
+        self.account(&sorted);
         self.clear(self.heard.len());
         self.state = State::Idle;
         Reply::new(Ok(Answer::Written), sent_at, None, &mut self.discarded)
@@ -541,9 +560,13 @@ impl Guard {
                     let lateness = self.lateness.entry(late.request.unit).or_default();
                     *lateness = (*lateness).max(heard_at.since(late.due));
                 }
-                // The quarantine waits for the last one.
+                // The quarantine waits for the last one, and a unit's rest for that unit's last one.
                 if index + 1 == self.unanswered.len() {
                     self.quarantine_until = None;
+                }
+                let unit = late.request.unit;
+                if self.unanswered[index + 1..].iter().all(|later| later.request.unit != unit) {
+                    self.resting.remove(&unit);
                 }
                 self.drop_strays(at + length);
                 return;
@@ -554,8 +577,7 @@ impl Guard {
     /// Counts and drops the first `count` bytes, which answer nothing that is asked now.
     fn drop_strays(&mut self, count: usize) {
         let sorted = sort(&self.heard[..count], &[], None, &self.unanswered);
-        self.count(sorted.discarded);
-        self.forget(&sorted.late);
+        self.account(&sorted);
         self.clear(count);
     }
 
@@ -572,8 +594,21 @@ impl Guard {
         });
     }
 
-    fn count(&mut self, more: Discarded) {
+    /// Counts what was heard beside an answer. Those whose late replies are in it owe nothing more.
+    fn account(&mut self, sorted: &Sorted) {
+        self.count(sorted);
+        self.forget(&sorted.late);
+    }
+
+    /// Before anything of it is forgotten.
+    fn count(&mut self, sorted: &Sorted) {
+        let more = sorted.discarded;
         let sum = &mut self.discarded;
+        for (index, end) in sorted.late.iter().zip(&sorted.late_ends) {
+            let late = &self.unanswered[*index];
+            let after = self.heard_at[end - 1].since(late.transmitted_at);
+            sum.late = Some(LateReply { unit: late.request.unit, after });
+        }
         sum.noise_bytes += more.noise_bytes;
         sum.late_replies += more.late_replies;
         sum.foreign_frames += more.foreign_frames;

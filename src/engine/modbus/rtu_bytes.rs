@@ -21,6 +21,8 @@ pub fn frame(unit: u8, pdu: &[u8]) -> Vec<u8> {
 #[derive(Clone, Debug)]
 pub struct Unanswered {
     pub request: Request,
+    /// When its last byte had left.
+    pub transmitted_at: Time,
     /// When its answer should have come.
     pub due: Time,
     /// When it was given up.
@@ -77,6 +79,8 @@ pub struct Sorted {
     pub damaged: usize,
     /// Indices of the unanswered requests whose replies were found.
     pub late: Vec<usize>,
+    /// Where each of these replies ends.
+    pub late_ends: Vec<usize>,
 }
 
 /// Sorts `bytes`, which hold no answer to `request` and are over: nothing more belongs to them.
@@ -99,6 +103,7 @@ pub fn sort(bytes: &[u8], own: &[u8], request: Option<&Request>, unanswered: &[U
         } else if let Some((index, length)) = late_reply(rest, unanswered, &sorted.late) {
             sorted.discarded.late_replies += 1;
             sorted.late.push(index);
+            sorted.late_ends.push(at + length);
             length
         } else if let Some(length) = foreign_frame(rest) {
             sorted.discarded.foreign_frames += 1;

@@ -8,6 +8,9 @@ use crate::engine::modbus::Call;
 use crate::engine::modbus::crc::crc;
 use crate::engine::settings::Parity;
 
+#[path = "rtu_late_tests.rs"]
+mod late;
+
 const TIMEOUT: Duration = Duration::from_millis(200);
 const LINE: Line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
 
@@ -102,7 +105,7 @@ impl Scene {
     fn expect(&mut self, what: &str, result: Result<Answer, RequestError>) -> Discarded {
         let (reply, _) = self.reply();
         assert_eq!(reply.result, result, "{what}");
-        reply.discarded
+        Discarded { late: None, ..reply.discarded }
     }
 
     /// The line still works, and says what it is asked.
@@ -610,55 +613,4 @@ fn piece() -> impl Strategy<Value = Vec<u8>> {
         Just(request),
         Just(relay),
     ]
-}
-
-#[test]
-fn after_a_probe_the_line_waits_only_as_long_as_that_unit_has_come_late_before() {
-    let probe = || Request { is_probe: true, ..two_inputs() };
-    let mut scene = Scene::without_echo();
-    scene.ask(&probe());
-    scene.expect("no answer", Err(RequestError::Timeout));
-    // Another unit is asked at once; the late reply meets its request and is told apart.
-    let other = read(2, Table::Input, 0, 2);
-    let given_up_at = scene.now;
-    scene.ask(&other);
-    assert!(scene.now - given_up_at <= whole_micros(LINE.frame_gap()), "{:?}", scene.now - given_up_at);
-    scene.wait(5).hears(framed("01 04 04 00 63 00 63")).wait(20).hears(framed("02 04 04 00 01 00 02"));
-    assert_eq!(scene.expect("the other", words(&[1, 2])), counts([0, 1, 0, 0, 0]));
-
-    // One that is heard between two requests says how late that unit is.
-    scene.ask(&probe());
-    scene.expect("no answer", Err(RequestError::Timeout));
-    scene.wait(30).hears(framed("01 04 04 00 63 00 63"));
-    scene.ask(&probe());
-    let due = scene.now + LINE.characters(8) + TIMEOUT;
-    scene.expect("no answer again", Err(RequestError::Timeout));
-    assert_eq!(scene.guard.begin(scene.now, &other, TIMEOUT), None);
-    assert_eq!(scene.guard.earliest_send(scene.now), due + Duration::from_millis(60));
-}
-
-#[test]
-fn a_unit_that_has_answered_late_is_waited_for_longer() {
-    // By how much it is late, and how long it is waited for then.
-    for (late, expected) in [(40, 260), (120, 380), (190, 400)] {
-        let mut scene = Scene::without_echo();
-        scene.ask(&two_inputs());
-        scene.expect("no answer", Err(RequestError::Timeout));
-        scene.wait(late).hears(framed("01 04 04 00 63 00 63"));
-        // Another unit is not.
-        for (request, wait) in [(two_inputs(), expected), (read(2, Table::Input, 0, 2), 200)] {
-            scene.ask(&request);
-            let sent_at = scene.now + LINE.characters(8);
-            scene.expect("no answer", Err(RequestError::Timeout));
-            assert_eq!(
-                scene.now - sent_at,
-                Duration::from_millis(wait),
-                "{late} ms late, unit {}",
-                request.unit
-            );
-            scene.wait(1000);
-        }
-        scene.ask(&two_inputs()).wait(150 + late).hears(framed("01 04 04 00 01 00 02"));
-        scene.expect("in time, since it is known", words(&[1, 2]));
-    }
 }

@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use crate::engine::modbus::pdu;
-use crate::engine::modbus::{Discarded, Reply, Request, RequestError};
+use crate::engine::modbus::{Discarded, LateReply, Reply, Request, RequestError};
 use crate::engine::time::{Duration, Time};
 
 /// Transaction, protocol, length and unit (3.1.3).
@@ -22,8 +22,15 @@ pub struct Guard {
     heard: Vec<u8>,
     /// Why the stream cannot be read any further.
     broken: Option<&'static str>,
-    unanswered: VecDeque<u16>,
+    unanswered: VecDeque<Unanswered>,
     discarded: Discarded,
+}
+
+#[derive(Debug)]
+struct Unanswered {
+    transaction: u16,
+    unit: u8,
+    sent_at: Time,
 }
 
 #[derive(Debug, Default)]
@@ -112,15 +119,16 @@ impl Guard {
     }
 
     pub fn wake(&mut self, now: Time) -> Option<Reply> {
-        let State::Waiting { sent_at, deadline, .. } = self.state else { return None };
-        if now < deadline {
+        let State::Waiting { request, sent_at, deadline, .. } = &self.state else { return None };
+        let (unit, sent_at) = (request.unit, *sent_at);
+        if now < *deadline {
             return None;
         }
         self.state = State::Idle;
         if self.unanswered.len() == UNANSWERED_MAX {
             self.unanswered.pop_front();
         }
-        self.unanswered.push_back(self.transaction);
+        self.unanswered.push_back(Unanswered { transaction: self.transaction, unit, sent_at });
         Some(Reply::new(Err(RequestError::Timeout), sent_at, None, &mut self.discarded))
     }
 
@@ -167,10 +175,11 @@ impl Guard {
             _ => None,
         };
         let Some((request, sent_at, first_byte_at)) = waiting else {
-            match self.unanswered.iter().position(|number| *number == transaction) {
-                Some(index) => {
-                    self.unanswered.remove(index);
+            let index = self.unanswered.iter().position(|late| late.transaction == transaction);
+            match index.and_then(|index| self.unanswered.remove(index)) {
+                Some(Unanswered { unit, sent_at, .. }) => {
                     self.discarded.late_replies += 1;
+                    self.discarded.late = Some(LateReply { unit, after: now - sent_at });
                 }
                 None => self.discarded.foreign_frames += 1,
             }
@@ -276,7 +285,11 @@ mod tests {
             }
             let reply = guard.received(Time(200_009), &frame(2, 1, &GOOD)).expect("the answer");
             assert_eq!(reply.result, Ok(Answer::Words(vec![1, 2])));
-            assert_eq!(reply.discarded, Discarded { late_replies: 1, ..Default::default() });
+            let late = Some(LateReply {
+                unit: 1,
+                after: Duration::from_micros(if after { 200_003 } else { 200_001 }),
+            });
+            assert_eq!(reply.discarded, Discarded { late_replies: 1, late, ..Default::default() });
         }
     }
 

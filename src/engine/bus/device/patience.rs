@@ -1,19 +1,19 @@
 //! How a silent device is asked: seldom and cheaply, and yet soon enough after its return.
 
-use crate::engine::time::Duration;
+use crate::engine::time::{Duration, Time};
 
 /// So many requests in a row without an answer, and a device counts as offline.
 pub(super) const FAILURES_UNTIL_OFFLINE: u32 = 3;
 /// The longest pause between two attempts: with the attempt itself, what a device's return may take to
 /// be noticed is 15 seconds.
 const PAUSE_LONGEST: Duration = Duration::from_millis(14_400);
-/// A pause is so many times as long as what it follows: a silent device makes the others at most 3 %
-/// slower, as far as [`PAUSE_LONGEST`] lets it.
-const SHARE: u32 = 35;
+/// A pause is so many times as long as what it follows: a silent device makes the others some 2.3 % slower, as
+/// far as [`PAUSE_LONGEST`] lets it. Of the 3 % that it may cost, the rest is for what is not foreseen here.
+const SHARE: u32 = 44;
 /// What an attempt costs beside the wait: its frame and the silence around it, at 19200 baud.
 const FRAME: Duration = Duration::from_millis(7);
 /// The shortest wait for the answer to a probe.
-const PROBE_SHORTEST: Duration = Duration::from_millis(40);
+const PROBE_SHORTEST: Duration = Duration::from_millis(30);
 /// So many times its slowest answer, and a device that is there has answered.
 const PROBE_FACTOR: u32 = 2;
 /// Of a device that has never answered nothing is known. Every other probe gives it the whole time; those
@@ -23,14 +23,26 @@ const PROBE_OF_UNKNOWN: Duration = Duration::from_millis(100);
 /// One slow answer among many shall not make every later probe slow: with each answer the slowest loses
 /// this part.
 const FADING: u32 = 64;
-/// A device that has answered before may come back slower than it went. From so many failures on (some two
-/// minutes), and then each time that they have doubled, a probe waits as long as any request: so seldom
-/// that it does not count in the device's share.
+/// A device that has answered before may come back slower than it went. Its answer to a probe is late then,
+/// but it is heard, or spoils what another one says: the next probe waits as long as any request. When that
+/// one is in vain, no other such sign counts for so many probes (some 13 seconds), and then for twice as many.
+const SIGNS_APART: u32 = 8;
+const SIGNS_APART_LONGEST: u32 = 256;
+/// And if no sign reaches us: from so many failures on (some two minutes), and then each time that they have
+/// doubled, so seldom that it does not count in the device's share.
 const FULL_PROBE_FROM: u32 = 64;
 /// And at the latest after so many, which may be two hours.
 const FULL_PROBE_EACH: u32 = 512;
 /// Pauses differ by so many hundredths, so that two silent devices do not keep step.
 const JITTER_PERCENT: u32 = 3;
+
+/// A device that is there and is asked the usual is waited for so many times its slowest answer lately,
+const HURRIED_FACTOR: u32 = 4;
+/// but so long at least: the specification gives the slowest unit that time to carry out a broadcast (Modbus
+/// over serial line V1.02, 2.4.1), and an adapter may hold back bytes for some hundredths of a second.
+const HURRIED_SHORTEST: Duration = Duration::from_millis(200);
+/// The slowest answer is remembered for so long at least, and twice as long at most.
+const SLOWEST_KEPT: Duration = Duration::from_secs(30 * 60);
 
 /// What is known of a device's way to answer.
 #[derive(Clone, Copy, Debug, Default)]
@@ -39,6 +51,15 @@ pub(super) struct Patience {
     failures: u32,
     /// From sending a request to its answer's first byte; old ones fade.
     slowest_answer: Option<Duration>,
+    /// The slowest answer to a read, late ones too: since [`Patience::lately_since`], and in the time before it.
+    slowest_lately: [Duration; 2],
+    lately_since: Time,
+    /// There is a sign that it is back: the next probe waits fully.
+    is_expected: bool,
+    /// Signs of its return that were none, since it last answered; and from how many failures on the next
+    /// one counts.
+    false_signs: u32,
+    signs_count_from: u32,
 }
 
 impl Patience {
@@ -47,18 +68,50 @@ impl Patience {
     }
 
     pub(super) fn answered(&mut self, latency: Option<Duration>) {
-        self.failures = 0;
+        self.start_anew();
         let faded = self.slowest_answer.map(|slowest| slowest * (FADING - 1) / FADING);
         self.slowest_answer = faded.max(latency);
     }
 
+    /// A read was answered after this time, be it late.
+    pub(super) fn took(&mut self, now: Time, time: Duration) {
+        if now - self.lately_since >= SLOWEST_KEPT {
+            self.slowest_lately = [Duration::ZERO, self.slowest_lately[0]];
+            self.lately_since = now;
+        }
+        self.slowest_lately[0] = self.slowest_lately[0].max(time);
+    }
+
+    /// How long to wait for the answer to something that the device has often been asked of late. Who has just
+    /// left something unanswered is waited for fully.
+    pub(super) fn hurried_timeout(&self, full: Duration, demanded: Option<Duration>) -> Duration {
+        let [lately, before] = self.slowest_lately;
+        let short = (lately.max(before) * HURRIED_FACTOR).max(HURRIED_SHORTEST);
+        if self.failures == 0 { short.max(demanded.unwrap_or_default()).min(full) } else { full }
+    }
+
     pub(super) fn unanswered(&mut self) {
         self.failures += 1;
+        if std::mem::take(&mut self.is_expected) {
+            let apart = (SIGNS_APART << self.false_signs.min(8)).min(SIGNS_APART_LONGEST);
+            self.signs_count_from = self.failures + apart;
+            self.false_signs += 1;
+        }
     }
 
     /// A new link: old silence says nothing about it.
     pub(super) fn start_anew(&mut self) {
         self.failures = 0;
+        self.is_expected = false;
+        self.false_signs = 0;
+        self.signs_count_from = 0;
+    }
+
+    /// While it is silent: something was heard that may be its late answer to a probe. Returns whether it is
+    /// worth asking at once.
+    pub(super) fn shows_sign(&mut self) -> bool {
+        self.is_expected |= self.is_probing() && self.failures >= self.signs_count_from;
+        self.is_expected
     }
 
     /// Whether the next request only asks whether the device is there again. Nobody waits for a late
@@ -70,7 +123,11 @@ impl Patience {
     /// How long to wait for the next answer. `full` is what the bus and the profile ask for; a probe
     /// of a device that is offline waits less, but never less than the profile's own `demanded`.
     pub(super) fn timeout(&self, full: Duration, demanded: Option<Duration>) -> Duration {
-        if self.is_probing() && !self.is_full_probe() { self.short_probe(full, demanded) } else { full }
+        if self.is_probing() && !self.is_expected && !self.is_full_probe() {
+            self.short_probe(full, demanded)
+        } else {
+            full
+        }
     }
 
     fn is_full_probe(&self) -> bool {
@@ -128,13 +185,13 @@ mod tests {
         for (failures, slowest, demanded, expected) in [
             (0, Some(9), None, 500),
             (2, Some(9), None, 500),
-            (3, Some(9), None, 40),
+            (3, Some(9), None, 30),
             (4, Some(40), None, 80),
             (4, Some(400), None, 500),
             (4, Some(9), Some(300), 300),
-            (8, Some(9), None, 40),
+            (8, Some(9), None, 30),
             (64, Some(9), None, 500),
-            (65, Some(9), None, 40),
+            (65, Some(9), None, 30),
             (1024, Some(9), None, 500),
             (1536, Some(9), None, 500),
             (2, None, None, 500),
@@ -168,14 +225,63 @@ mod tests {
             [(Some(13), 10, 50), (Some(13), 10, 5000), (None, 10, 2), (None, 10, 100)]
         {
             let (cost, longest) = cost(known, from, probes);
-            assert!(cost <= 0.03, "{known:?} {from} {probes}: {cost}");
-            let return_within = if known.is_some() { 2_000 } else { 12_000 };
+            assert!(cost <= 0.025, "{known:?} {from} {probes}: {cost}");
+            let return_within = if known.is_some() { 1_700 } else { 14_100 };
             // A full probe comes late itself, once in minutes.
             let longest = if probes > 50 && known.is_some() { longest - FULL } else { longest };
             assert!(longest <= Duration::from_millis(return_within), "{known:?}: {longest:?}");
         }
         // A slow one may cost more, but is not left alone for longer.
         assert!(cost(Some(150), 10, 100).1 <= Duration::from_secs(15));
+    }
+
+    #[test]
+    fn a_known_device_is_waited_for_four_times_its_slowest_answer_of_the_last_half_hour() {
+        let ms = Duration::from_millis;
+        for (slowest, demanded, expected) in
+            [(9, None, 200), (60, None, 240), (130, None, 500), (9, Some(300), 300), (9, Some(700), 500)]
+        {
+            let mut patience = silent(0, Some(9));
+            patience.took(Time::default(), ms(slowest));
+            assert_eq!(
+                patience.hurried_timeout(FULL, demanded.map(ms)),
+                ms(expected),
+                "{slowest} {demanded:?}"
+            );
+            // Who has just left something unanswered is waited for fully.
+            patience.unanswered();
+            assert_eq!(patience.hurried_timeout(FULL, demanded.map(ms)), FULL);
+        }
+        let mut patience = silent(0, Some(9));
+        let expected = |minutes: u64| if minutes < 65 { ms(400) } else { ms(200) };
+        patience.took(Time::from_millis(9 * 60_000), ms(100));
+        for minutes in [10, 35, 64, 65] {
+            patience.took(Time::from_millis(minutes * 60_000), ms(9));
+            assert_eq!(patience.hurried_timeout(FULL, None), expected(minutes), "{minutes}");
+        }
+    }
+
+    #[test]
+    fn a_sign_of_its_return_is_worth_a_long_probe_but_not_again_and_again() {
+        let full = |patience: &Patience| patience.timeout(FULL, None) == FULL;
+        let mut patience = silent(2, Some(9));
+        assert!(!patience.shows_sign(), "it is not even offline");
+        patience = silent(5, Some(9));
+        assert!(!full(&patience) && patience.shows_sign() && full(&patience));
+        patience.unanswered();
+        // Signs without end, on a line with much noise.
+        let mut long_probes = Vec::new();
+        for probe in 0..50 {
+            patience.shows_sign();
+            if full(&patience) {
+                long_probes.push(probe);
+            }
+            patience.unanswered();
+        }
+        assert_eq!(long_probes, [8, 25]);
+        patience.answered(Some(Duration::from_millis(9)));
+        (0..4).for_each(|_| patience.unanswered());
+        assert!(patience.shows_sign() && full(&patience), "an answer was the best sign");
     }
 
     #[test]

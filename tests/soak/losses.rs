@@ -1,0 +1,138 @@
+//! What single requests that are lost cost, and that none is lost for ever.
+
+use busker::engine::bus::{Command, Event};
+use busker::engine::configuration;
+use busker::engine::profile::Library;
+use busker::engine::settings::Settings;
+use busker::engine::time::{Duration, Time};
+use busker::simulator::LineSettings;
+use busker::simulator::device::Place;
+use busker::simulator::line::Line;
+use busker::simulator::script::Action;
+
+use crate::device::{BLOCK, BLOCKS, Diary, Timepiece};
+use crate::world::World;
+
+/// By then each read has been answered often.
+const KNOWN: Duration = Duration::from_secs(20);
+const FULL: Duration = Duration::from_millis(500);
+
+#[test]
+fn a_lost_request_to_a_quick_unit_costs_the_others_less_than_its_response_timeout() {
+    let mut world = world(3, "1ms");
+    world.run_until(world.now + KNOWN);
+    let from = world.now;
+    fault(&mut world, 1, "silent,every=40");
+    world.run_until(from + Duration::from_secs(60));
+    let requests = requests(&world, from);
+    let to_others: Vec<Time> = requests.iter().filter(|(_, unit)| *unit != 1).map(|(at, _)| *at).collect();
+    let longest = longest(&to_others);
+    assert!(longest > Duration::from_millis(200), "nothing was lost: {longest:?}");
+    // Not the response timeout and as long a quarantine: the longest is the first reply behind it, which is
+    // believed when no second one comes, as it could be the late one.
+    assert!(longest < Duration::from_millis(600), "{longest:?}");
+    // The unit itself is left alone for as long as ever.
+    let own: Vec<Time> = requests.iter().filter(|(_, unit)| *unit == 1).map(|(at, _)| *at).collect();
+    assert!(self::longest(&own) >= FULL * 2, "{:?}", self::longest(&own));
+}
+
+#[test]
+fn a_unit_that_is_slow_now_and_then_is_waited_for_once_that_is_known() {
+    // On a busy line what comes late meets what others say, on a calm one it is heard.
+    for poll in ["1ms", "1s"] {
+        let mut world = world(3, poll);
+        world.run_until(world.now + KNOWN * 3);
+        fault(&mut world, 2, "slow=330ms,every=60");
+        world.run_until(world.now + Duration::from_secs(20 * 60));
+        // Some twenty slow answers, or some hundreds.
+        let late = world.late_replies() + u64::from(world.collisions);
+        assert!((1..=3).contains(&late), "each {poll}: {late}");
+    }
+}
+
+#[test]
+fn a_write_is_waited_for_fully_and_so_are_the_reads_behind_it() {
+    let mut world = world(3, "100ms");
+    world.run_until(world.now + KNOWN);
+    fault(&mut world, 2, "slow=400ms");
+    let (device, point, payload) = ("device_2".into(), "level".into(), "7".into());
+    world.tell(Event::Command(Command { device, point, payload, retained: false }));
+    world.run_until(world.now + Duration::from_secs(4));
+    let outcome = world.published.iter().find(|published| published.message.topic.ends_with("/outcome"));
+    assert!(outcome.expect("an outcome").message.payload.contains("done"));
+    assert_eq!(world.late_replies(), 0);
+}
+
+#[test]
+fn what_is_disturbed_in_step_with_the_polls_starves_no_reading() {
+    for units in [1, 4] {
+        for every in 2..=8 {
+            for poll in ["1ms", "200ms"] {
+                let mut world = world(units, poll);
+                world.run_until(world.now + KNOWN);
+                fault(&mut world, 1, &format!("silent,every={every}"));
+                let from = world.now;
+                world.run_until(from + Duration::from_secs(60));
+                let longest = without_news(&world, from);
+                let what = format!("{units} units, every {every}th request, each {poll}");
+                assert!(longest < Duration::from_secs(8), "{what}: {longest:?}");
+            }
+        }
+    }
+}
+
+/// For how long at most any reading of unit 1 was not told anew.
+fn without_news(world: &World, from: Time) -> Duration {
+    let topics = BLOCKS.map(|block| format!("busker/device_1/reading_{block}"));
+    let of_topic = |topic: &String| {
+        let told = world.published.iter().filter(|told| told.message.topic == *topic && told.at >= from);
+        let times: Vec<Time> =
+            std::iter::once(from).chain(told.map(|told| told.at)).chain([world.now]).collect();
+        longest(&times)
+    };
+    topics.iter().map(of_topic).max().expect("topics")
+}
+
+fn longest(times: &[Time]) -> Duration {
+    times.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(Duration::MAX)
+}
+
+fn requests(world: &World, from: Time) -> Vec<(Time, u8)> {
+    world.requests().into_iter().filter(|(at, _)| *at >= from).collect()
+}
+
+fn fault(world: &mut World, unit: u8, fault: &str) {
+    world.act(unit, &Action::Fault(format!("unit={unit},{fault}").parse().expect("a fault")));
+}
+
+/// Units from 1 on with two reads each, and a register that is written.
+fn world(units: u8, poll: &str) -> World {
+    let turnaround = Duration::from_millis(5);
+    let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
+    for unit in 1..=units {
+        let at = Place { unit, device: format!("device_{unit}") };
+        line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
+    }
+    World::new(gateway(units, poll), line)
+}
+
+fn gateway(units: u8, poll: &str) -> Settings {
+    let addresses = BLOCKS.iter().flat_map(|block| *block..block + BLOCK);
+    let mut points: Vec<String> =
+        addresses.map(|address| format!("reading_{address}: {{at: input {address}, poll: fast}}")).collect();
+    points.push("level: {at: holding 0, write: 0..65535, poll: fast}".into());
+    let mut text = format!(
+        "buses: {{line: {{serial: /dev/ttyUSB0, baud: 19200, parity: even, response_timeout: {}ms}}}}\ndevices:\n",
+        FULL.as_millis()
+    );
+    for unit in 1..=units {
+        let points = points.join(", ");
+        text += &format!(
+            "  device_{unit}: {{bus: line, unit: {unit}, poll: {{fast: {poll}}}, points: {{{points}}}}}\n"
+        );
+    }
+    match configuration::load("losses.yaml", text.as_bytes(), &Library::shipped()) {
+        Ok((settings, _)) => settings,
+        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
+    }
+}
