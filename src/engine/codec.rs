@@ -10,7 +10,7 @@ use crate::engine::address::Address;
 use crate::engine::device::{
     Case, Condition, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Unit, WriteRule,
 };
-use crate::engine::value::{Decimal, Missing, Reading};
+use crate::engine::value::{Decimal, Missing, Moment, Reading};
 
 /// One point's interpretation as it is now, with everything decided that other registers decide.
 #[derive(Clone, Debug, PartialEq)]
@@ -117,8 +117,7 @@ fn resolve_form<'d>(
     };
     let decimals = match form.kind {
         Kind::F32 | Kind::F64 => form.decimals.map(|_| shift),
-        Kind::Bool => None,
-        kind if kind.is_text() || matches!(form.names, Names::All(_)) => None,
+        _ if !form.is_number() => None,
         _ => Some((form.scale.decimals + shift).max(form.offset.decimals)),
     };
     Ok(Resolved { form, decimals, shift, unit, case })
@@ -298,10 +297,16 @@ fn read_integer(resolved: &Resolved<'_>, raw: i128) -> Reading {
             other => Reading::Missing(Missing::UnknownValue(other)),
         };
     }
-    match to_unit(resolved, raw) {
-        Some(number) => Reading::Number(number),
-        None => Reading::Missing(Missing::NotANumber),
+    let number = to_unit(resolved, raw);
+    if let Some(since) = form.since {
+        // A clock that nobody has set counts from nothing, or has not begun to.
+        let seconds = number
+            .filter(|_| raw != 0)
+            .and_then(|number| number.checked_add(Decimal::integer(since.0.into())));
+        let moment = seconds.and_then(Moment::new);
+        return moment.map_or(Reading::Missing(Missing::NotAMoment), Reading::Moment);
     }
+    number.map_or(Reading::Missing(Missing::NotANumber), Reading::Number)
 }
 
 /// A raw number in the point's unit, with all the digits that scale, decimals and offset give.
@@ -389,6 +394,9 @@ pub fn encode(
     let form = resolved.form;
     if let WriteRule::Press { word, .. } = rule {
         return if text == "PRESS" { Ok(vec![*word]) } else { Err(format!("`{text}` is not `PRESS`")) };
+    }
+    if form.since.is_some() {
+        return Err("a moment cannot be written".to_string());
     }
     let mut words = if form.kind.is_text() {
         encode_text(form, text)?

@@ -4,6 +4,7 @@ use super::*;
 use crate::engine::address::{Address, Bits, Span, Table};
 use crate::engine::device::{Order, Point, Poll, Write};
 use crate::engine::test_device::device_of;
+use crate::engine::time::Date;
 
 fn decimal(text: &str) -> Decimal {
     Decimal::parse(text).expect("a decimal in a test")
@@ -114,6 +115,30 @@ fn texts_codes_and_dates() {
     check_read(Form::new(Kind::LetterNumber), "0011", "None");
     check_read(Form::new(Kind::DayMonthYear), "03FA", "01.01.2018");
     check_read(Form::new(Kind::DayMonthYear), "0000", "None");
+}
+
+#[test]
+fn seconds_since_a_day_are_a_moment() {
+    let since = |kind, year: u64| with(kind, |form| form.since = Date::of_day(year, 1, 1));
+    check_read(since(Kind::U32, 1970), "6B09 13F0", "2026-11-27T05:24:00+00:00");
+    check_read(since(Kind::U64, 1970), "0000 0000 6B09 13F0", "2026-11-27T05:24:00+00:00");
+    check_read(since(Kind::U32, 2000), "3296 6E5A", "2026-11-23T03:24:10+00:00");
+    // Of milliseconds; of days.
+    let scaled = |scale: &str, kind| Form { scale: decimal(scale), ..since(kind, 1970) };
+    check_read(scaled("0.001", Kind::U48), "01A1 6A5B E1C2", "2026-10-23T20:02:48.898+00:00");
+    check_read(scaled("86400", Kind::U16), "5130", "2026-11-27T00:00:00+00:00");
+    // Nobody has set the clock; before 1970; behind what there are dates for.
+    check_read(since(Kind::U32, 1970), "0000 0000", "None");
+    check_read(since(Kind::I32, 1970), "FFFF FFFF", "None");
+    check_read(since(Kind::U64, 1970), "FFFF FFFF FFFF FFFF", "None");
+    let invalid = Form { invalid: vec![(0xFFFF_FFFF, "not set".into())], ..since(Kind::U32, 1970) };
+    check_read(invalid, "FFFF FFFF", "None");
+    check_write(
+        since(Kind::U32, 1970),
+        WriteRule::Any,
+        "2026-11-27T05:24:00+00:00",
+        Err("a moment cannot be written"),
+    );
 }
 
 #[test]

@@ -7,7 +7,7 @@ mod thing;
 pub use thing::{PRESS, State, Thing, ThingCommand, ThingKind};
 
 use crate::engine::address::{Address, Span};
-use crate::engine::time::Duration;
+use crate::engine::time::{Date, Duration};
 use crate::engine::value::Decimal;
 
 /// Index into [`Device::points`].
@@ -302,6 +302,8 @@ pub struct Form {
     pub scale: Decimal,
     pub offset: Decimal,
     pub decimals: Option<Decimals>,
+    /// The value counts seconds since then and stands for a moment.
+    pub since: Option<Date>,
     pub unit: Unit,
     /// A difference between two values (an offset, a hysteresis): 5 K are not 41 °F.
     pub difference: bool,
@@ -325,6 +327,7 @@ impl Form {
             scale: Decimal::ONE,
             offset: Decimal::ZERO,
             decimals: None,
+            since: None,
             unit: Unit::None,
             difference: false,
             names: Names::None,
@@ -332,6 +335,12 @@ impl Form {
             invalid: Vec::new(),
             range: None,
         }
+    }
+
+    /// Whether it is a quantity, of which some values may have names: nothing else has a unit or digits.
+    pub fn is_number(&self) -> bool {
+        let is_enumeration = matches!(self.names, Names::All(_));
+        self.kind != Kind::Bool && !self.kind.is_text() && !is_enumeration && self.since.is_none()
     }
 }
 

@@ -82,6 +82,9 @@ fn meaning(device: &Device, form: &Form, lists: &mut Vec<String>) -> String {
     if form.offset != Decimal::ZERO {
         words.push(format!("+ {}", form.offset));
     }
+    if let Some(since) = form.since {
+        words.push(format!("seconds since {since}"));
+    }
     match &form.unit {
         Unit::Fixed(unit) => words.push(unit.clone()),
         Unit::By(point) => words.push(format!("unit of {}", device.points[*point].name)),

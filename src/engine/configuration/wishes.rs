@@ -2,7 +2,7 @@
 
 use crate::engine::configuration::file::PointWish;
 use crate::engine::device::{
-    self, Condition, Device, Encoding, Form, Kind, Names, Point, PointIndex, Poll, Thing, Unit,
+    self, Condition, Device, Encoding, Form, Kind, Point, PointIndex, Poll, Thing, Unit,
 };
 use crate::engine::profile::file;
 use crate::engine::units::{self, Release};
@@ -71,7 +71,7 @@ fn apply_one(
         give_unit(point, unit, faults);
     }
     if let Some(deadband) = &wish.deadband {
-        if !forms(point).any(is_number) {
+        if !forms(point).any(|form| form.is_number() || form.since.is_some()) {
             faults.add(
                 &deadband.place,
                 format!("`{}` is no number; only a number has a `deadband`", point.name),
@@ -217,7 +217,7 @@ fn give_unit(point: &mut Point, unit: &At<String>, faults: &mut Faults) {
     let name = &point.name;
     let refusal = match &mut point.encoding {
         Encoding::Cases { .. } => format!("the unit of `{name}` follows its case; remove `unit`"),
-        Encoding::Plain(form) if !is_number(form) => {
+        Encoding::Plain(form) if !form.is_number() => {
             format!("`{name}` is no number and has no unit; remove `unit`")
         }
         Encoding::Plain(form) => match &form.unit {
@@ -266,7 +266,9 @@ fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults) {
         };
         let (class, state) =
             (point.presentation.device_class.as_deref(), point.presentation.state_class.as_deref());
-        if let (Some(place), Err(message)) = (place, units::check(platform, class, unit, state)) {
+        let fits = units::check(platform, class, unit, state);
+        let fits = fits.and_then(|()| units::check_sense(platform, form, class, state));
+        if let (Some(place), Err(message)) = (place, fits) {
             faults.add(place, message);
             return;
         }
@@ -305,8 +307,4 @@ fn forms(point: &Point) -> impl Iterator<Item = &Form> {
         Encoding::Cases { cases, .. } => (None, cases.as_slice()),
     };
     plain.into_iter().chain(cases.iter().filter_map(|case| case.form.as_ref()))
-}
-
-fn is_number(form: &Form) -> bool {
-    form.kind != Kind::Bool && !form.kind.is_text() && !matches!(form.names, Names::All(_))
 }

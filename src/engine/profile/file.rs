@@ -5,7 +5,7 @@ use serde_json::{Value as Json, json};
 use crate::engine::address::{Address, Span};
 use crate::engine::device::{Category, Kind, Order, Platform, Poll, ThingKind, WriteFunction};
 use crate::engine::profile::text::{Digits, Name, PointPath, Quirk, Range, Repeat, Step, Writable};
-use crate::engine::time::Duration;
+use crate::engine::time::{Date, Duration};
 use crate::engine::value::Decimal;
 use crate::engine::yaml::{At, Content, Definitions, Faults, Map, Node, Read};
 use crate::record;
@@ -203,6 +203,9 @@ record! {
         offset: Option<At<Decimal>>,
         /// Digits behind the dot of what the register holds, or the point that says how many.
         decimals: Option<At<Digits>>,
+        /// The register counts seconds since this day began (UTC), `1970-01-01` or `2000-01-01`, and stands for a
+        /// moment.
+        since: Option<At<Date>>,
         /// The unit, as Home Assistant spells it. Beside a shared `is`: instead of each `unit_by` there.
         unit: Option<At<String>>,
         /// The point whose named value is the unit.

@@ -146,6 +146,7 @@ impl Resolution<'_, '_> {
                 self.lookup(&path, expanded).map(Decimals::By)
             }
         };
+        resolved.since = form.since.as_ref().map(|since| since.value);
         // The point's own unit stands where a shared case leaves it to a point that this device has not.
         resolved.unit = match (&form.unit, &form.unit_by, &expanded.file.form.unit) {
             (Some(unit), _, _) | (None, Some(_), Some(unit)) => Unit::Fixed(unit.value.clone()),
