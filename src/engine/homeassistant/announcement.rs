@@ -235,7 +235,7 @@ pub fn announcement(
 /// How the device is on its wire.
 fn diagnostics(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> Components {
     let (topic, entity, key, object) = (own.health(), &device.name, "wire_", "value_json");
-    let place = Place { identity, entity, key, topic: &topic, object };
+    let place = Place { identity, entity, key, topic: &topic, object, may_lack: false };
     let mut components = place.times(&["turnaround_p95"]);
     for (class, name) in [(Poll::Fast, "Period of fast polls"), (Poll::Slow, "Period of slow polls")] {
         if device.device.points.iter().any(|point| point.poll == class) {
