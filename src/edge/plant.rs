@@ -7,7 +7,7 @@ use crate::edge::bus_thread::BusHandle;
 use crate::edge::clock::Clock;
 use crate::edge::mqtt::{BrokerState, Mailbox, News};
 use crate::engine::bus::{Command, Event, Full, REPLACED};
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::command::{OutcomeKind, Wish};
 use crate::engine::health::{BrokerReport, GatewayReport};
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
@@ -146,7 +146,7 @@ impl Plant {
                     Ok(Some(older)) => (older, (OutcomeKind::Expired, REPLACED)),
                     Err(Full) => (command, (OutcomeKind::Refused, "too many commands wait")),
                 };
-                let outcome = Outcome::new(outcome.0, &command.payload, outcome.1);
+                let outcome = Wish::parse(&command.payload).ended(outcome.0, outcome.1);
                 let topic = parts.topics_of(&device).outcome(&command.point);
                 parts.mailbox.push(Message::once(topic, outcome.to_json()));
             }

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::engine::address::{Address, Bits, Span, Table};
-use crate::engine::device::{Order, Point, Poll, Write};
+use crate::engine::device::{Order, OutOfRange, Point, Poll, Write, WriteRule};
 use crate::engine::test_device::device_of;
 use crate::engine::time::Date;
 
@@ -161,7 +161,14 @@ fn a_wish_is_checked_rounded_and_encoded() {
     check_write(seconds.clone(), watchdog.clone(), "1,5", Err("`1,5` is not a number"));
     check_write(seconds, watchdog, "None", Err("`None` is not a number"));
     let half_steps = with(Kind::U16, |form| form.decimals = Some(Decimals::Fixed(1)));
-    check_write(half_steps, range("4", "20", Some("0.5")), "4.3", Ok("002D"));
+    check_write(half_steps.clone(), range("4", "20", Some("0.5")), "4.3", Ok("002D"));
+    check_write(half_steps.clone(), range("4", "20", Some("0.5")), "4.500000000000001", Ok("002D"));
+    // Steps begin at the smallest value, and end before the largest where that is between two.
+    check_write(half_steps.clone(), range("1", "9.8", Some("2")), "4.1", Ok("0032"));
+    check_write(half_steps, range("1", "9.8", Some("2")), "9.8", Ok("005A"));
+    let thirds = with(Kind::U16, |form| form.scale = decimal("0.3"));
+    check_write(thirds.clone(), range("0", "10.4", None), "10.4", Ok("0022"));
+    check_write(thirds, range("0.2", "10.4", None), "0.3", Ok("0001"));
     check_write(Form::new(Kind::I16), WriteRule::Any, "-32768", Ok("8000"));
     check_write(Form::new(Kind::I16), WriteRule::Any, "32768", Err("`32768` is outside -32768 to 32767"));
     check_write(Form::new(Kind::U48), WriteRule::Any, "281474976710655", Ok("FFFF FFFF FFFF"));
@@ -227,4 +234,57 @@ fn the_digits_shown_are_those_that_one_step_of_the_register_moves() {
         let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
         assert_eq!(resolved.display_precision(), Some(expected), "{scale} {shift}");
     }
+}
+
+#[test]
+fn what_is_made_of_a_wish_is_said() {
+    let tenths = with(Kind::I16, |form| {
+        form.decimals = Some(Decimals::Fixed(1));
+        form.names = Names::Some(vec![(11111, "automatic".into())]);
+    });
+    let range = |step: Option<&str>| WriteRule::Range {
+        min: decimal("-5"),
+        max: decimal("30"),
+        step: step.map(decimal),
+    };
+    let (half, any) = (range(Some("0.5")), range(None));
+    let (refuse, clamp) = (OutOfRange::Refuse, OutOfRange::Clamp);
+    for (rule, out_of_range, text, expected) in [
+        (&any, refuse, "21.5", Ok(("00D7", None))),
+        (&any, refuse, "21.0", Ok(("00D2", None))),
+        (&any, refuse, "automatic", Ok(("2B67", None))),
+        // What a calculation with floats leaves is nothing to speak of.
+        (&any, refuse, "21.400000000000002", Ok(("00D6", None))),
+        (&any, refuse, "0.30000000000000004", Ok(("0003", None))),
+        (&any, refuse, "21.44", Ok(("00D6", Some("`21.44` is rounded to 21.4")))),
+        (&any, refuse, "1e-05", Ok(("0000", Some("`1e-05` is rounded to 0.0")))),
+        (&half, refuse, "21.3", Ok(("00D7", Some("`21.3` is rounded to 21.5")))),
+        (&any, refuse, "30.1", Err("`30.1` is outside -5 to 30")),
+        (&any, clamp, "30.0", Ok(("012C", None))),
+        (&any, clamp, "30.1", Ok(("012C", Some("`30.1` is out of range, and 30.0 the nearest value in it")))),
+        (
+            &half,
+            clamp,
+            "-1e6",
+            Ok(("FFCE", Some("`-1e6` is out of range, and -5.0 the nearest value in it"))),
+        ),
+        (&any, clamp, "automatic", Ok(("2B67", None))),
+        (&any, clamp, "nan", Err("`nan` is not a number")),
+    ] {
+        let mut device = device(tenths.clone(), registers(1), rule.clone());
+        let mut write = device.points[0].write.take().expect("it is written");
+        write.out_of_range = out_of_range;
+        let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+        let found = obey(&device.points[0], &write, &resolved, text);
+        let expected = expected.map_err(str::to_string);
+        let expected =
+            expected.map(|(hex, note)| Obeyed { words: words(hex), note: note.map(str::to_string) });
+        assert_eq!(found, expected, "{text} {out_of_range:?}");
+    }
+    // A float is as exact as a float is.
+    let mut float = device(Form::new(Kind::F32), registers(2), WriteRule::Any);
+    let write = float.points[0].write.take().expect("it is written");
+    let resolved = resolve(&float, 0, &[None]).expect("a plain form resolves");
+    let found = obey(&float.points[0], &write, &resolved, "21.1");
+    assert_eq!(found, Ok(Obeyed { words: words("41A8 CCCD"), note: None }));
 }

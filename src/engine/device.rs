@@ -200,6 +200,18 @@ impl Point {
         self.write.as_ref().is_some_and(|write| matches!(write.rule, WriteRule::Press { .. }))
     }
 
+    /// Whether numbers are written to it, in one case at least.
+    pub fn takes_numbers(&self) -> bool {
+        let rule = self.write.as_ref().map(|write| &write.rule);
+        let is_number = match &self.encoding {
+            Encoding::Plain(form) => form.is_number(),
+            Encoding::Cases { cases, .. } => {
+                cases.iter().filter_map(|case| case.form.as_ref()).any(Form::is_number)
+            }
+        };
+        is_number && matches!(rule, Some(WriteRule::Any | WriteRule::Range { .. }))
+    }
+
     /// The one interpretation, for a point without cases.
     pub fn plain(&self) -> Option<&Form> {
         match &self.encoding {
@@ -504,11 +516,37 @@ pub struct Write {
     pub settle: Duration,
     /// The device acts only when the content changes: this register value stands between two equal ones.
     pub on_change: Option<i128>,
+    pub out_of_range: OutOfRange,
 }
 
 impl Write {
     pub fn new(at: Address, rule: WriteRule) -> Write {
-        Write { at, with: None, rule, settle: Duration::ZERO, on_change: None }
+        Write {
+            at,
+            with: None,
+            rule,
+            settle: Duration::ZERO,
+            on_change: None,
+            out_of_range: OutOfRange::Refuse,
+        }
+    }
+}
+
+/// What becomes of a command with a number beyond the limits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum OutOfRange {
+    #[default]
+    Refuse,
+    /// The limit is written, and the outcome says so.
+    Clamp,
+}
+
+impl OutOfRange {
+    pub const fn name(self) -> &'static str {
+        match self {
+            OutOfRange::Refuse => "refuse",
+            OutOfRange::Clamp => "clamp",
+        }
     }
 }
 

@@ -1,8 +1,8 @@
 //! The expanded points as a table for people, with the long lists below it.
 
 use busker::engine::device::{
-    Condition, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Thing, Unit, Write,
-    WriteFunction, WriteRule,
+    Condition, Decimals, Device, Encoding, Form, Kind, Names, OutOfRange, Point, PointIndex, Thing, Unit,
+    Write, WriteFunction, WriteRule,
 };
 use busker::engine::time::Duration;
 use busker::engine::value::Decimal;
@@ -137,6 +137,9 @@ fn writing(point: &Point, write: &Write) -> String {
     }
     if let Some(function) = write.with {
         words.push(format!("with function {}", WriteFunction::code(function)));
+    }
+    if write.out_of_range == OutOfRange::Clamp {
+        words.push("or the nearest of it".into());
     }
     if let Some(between) = write.on_change {
         words.push(format!("with {between} between two equal ones"));

@@ -160,6 +160,8 @@ fn point(device: &Device, index: PointIndex) -> Json {
     // Beside the macro, which takes no more keys.
     let ranges = point.ranges.iter().map(|(name, form)| (name.clone(), form_json(device, form)));
     json["ranges"] = ranges.collect::<Map<_, _>>().into();
+    json["out_of_range"] =
+        write.filter(|_| point.takes_numbers()).map(|write| write.out_of_range.name()).into();
     json["since"] = plain.and_then(|form| form.since).map(since).into();
     json
 }

@@ -85,6 +85,16 @@ fn apply_one(
         }
         point.deadband = Some(deadband.value);
     }
+    let takes_numbers = point.takes_numbers();
+    if let Some(out_of_range) = &wish.out_of_range {
+        match &mut point.write {
+            Some(write) if takes_numbers => write.out_of_range = out_of_range.value,
+            _ => faults.add(
+                &out_of_range.place,
+                format!("no number is written to `{}`; remove `out_of_range`", point.name),
+            ),
+        }
+    }
     let look = &wish.presentation;
     if let Some(icon) = &look.icon {
         let good = icon.split_once(':').is_some_and(|(set, name)| !set.is_empty() && !name.is_empty());
@@ -104,6 +114,7 @@ fn apply_to_thing(thing: &mut Thing, wish: &PointWish, faults: &mut Faults) {
         wish.range.as_ref().map(|key| ("range", &key.place)),
         wish.deadband.as_ref().map(|key| ("deadband", &key.place)),
         wish.poll.as_ref().map(|key| ("poll", &key.place)),
+        wish.out_of_range.as_ref().map(|key| ("out_of_range", &key.place)),
         look.r#as.as_ref().map(|key| ("as", &key.place)),
         look.state_class.as_ref().map(|key| ("state_class", &key.place)),
         wish.when.iter().next().map(|(key, _)| ("when", &key.place)),

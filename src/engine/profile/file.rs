@@ -3,7 +3,7 @@
 use serde_json::{Value as Json, json};
 
 use crate::engine::address::{Address, Span};
-use crate::engine::device::{Category, Kind, Order, Platform, Poll, ThingKind, WriteFunction};
+use crate::engine::device::{Category, Kind, Order, OutOfRange, Platform, Poll, ThingKind, WriteFunction};
 use crate::engine::profile::text::{Digits, Name, PointPath, Quirk, Range, Repeat, Step, Writable};
 use crate::engine::time::{Date, Duration};
 use crate::engine::value::Decimal;
@@ -145,6 +145,8 @@ record! {
         poll: Option<At<Poll>>,
         /// What may be written: `any`, `0..3`, `4..20 step 0.5`, or some of the named values.
         write: Option<At<Writable>>,
+        /// What becomes of a command with a number beyond the range; `refuse` where it is left out.
+        out_of_range: Option<At<OutOfRange>>,
         /// Where it is written, if not where it is read.
         write_at: Option<At<Address>>,
         /// As `step`, for `write_at`.

@@ -339,6 +339,7 @@ impl Resolution<'_, '_> {
             rule,
             settle: file.settle.as_ref().map(|settle| settle.value).unwrap_or_default(),
             on_change,
+            out_of_range: file.out_of_range.as_ref().map(|clamps| clamps.value).unwrap_or_default(),
         })
     }
 

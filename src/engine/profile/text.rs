@@ -4,7 +4,7 @@ use serde_json::{Value as Json, json};
 
 use crate::choices;
 use crate::engine::address::{Address, Bits, Span, Table};
-use crate::engine::device::{Category, Kind, Order, Platform, Poll, ThingKind, WriteFunction};
+use crate::engine::device::{Category, Kind, Order, OutOfRange, Platform, Poll, ThingKind, WriteFunction};
 use crate::engine::time::Date;
 use crate::engine::value::Decimal;
 use crate::engine::yaml::{At, Content, Definitions, Faults, Node, Read, Scalar};
@@ -22,6 +22,10 @@ choices! { "a function code that writes", WriteFunction {
     "6" => WriteFunction::SingleRegister,
     "15" => WriteFunction::MultipleCoils,
     "16" => WriteFunction::MultipleRegisters,
+} }
+
+choices! { "what becomes of a value out of range", OutOfRange {
+    "refuse" => OutOfRange::Refuse, "clamp" => OutOfRange::Clamp,
 } }
 
 choices! { "a platform of a single point", Platform {

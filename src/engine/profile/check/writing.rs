@@ -13,7 +13,19 @@ impl Rules<'_, '_> {
         self.what_is_written_can_be();
         self.the_function_fits_the_place();
         self.what_is_written_fits_the_value();
+        self.only_a_number_is_out_of_range();
         self.what_reading_clears_is_not_written();
+    }
+
+    fn only_a_number_is_out_of_range(&mut self) {
+        for Subject { file, point, .. } in self.entries() {
+            if let Some(key) = file.out_of_range.as_ref().filter(|_| !point.takes_numbers()) {
+                self.faults.add(
+                    &key.place,
+                    "`out_of_range` of a point that no number is written to; remove it, or add a range as in `write: 0..100`",
+                );
+            }
+        }
     }
 
     fn only_what_is_written_says_how(&mut self) {
