@@ -273,6 +273,11 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
         if responding {
             shutdown::feed_watchdog();
         }
+        if reporter.is_changing() {
+            // Not all buses are there; when they are, it is told at once.
+            (seen, told) = (None, None);
+            continue;
+        }
         let (topics, mailbox) = (plant.topics(), plant.mailbox());
         let states = states(&report);
         let of_device =

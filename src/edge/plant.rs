@@ -8,7 +8,7 @@ use crate::edge::clock::Clock;
 use crate::edge::mqtt::{BrokerState, Mailbox, News};
 use crate::edge::stir::Stir;
 use crate::engine::bus::{Command, Event, Full, REPLACED};
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::command::{Outcome, OutcomeKind, Wish};
 use crate::engine::health::{BrokerReport, GatewayReport};
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
@@ -171,7 +171,7 @@ impl Parts {
             Ok(Some(older)) => (older, OutcomeKind::Expired, REPLACED),
             Err(Full) => (command, OutcomeKind::Refused, "too many commands wait"),
         };
-        self.tell_outcome(&device, &command.point, &Outcome::new(kind, &command.payload, reason));
+        self.tell_outcome(&device, &command.point, &Wish::parse(&command.payload).ended(kind, reason));
     }
 
     fn tell_outcome(&self, device: &str, point: &str, outcome: &Outcome) {

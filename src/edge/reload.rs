@@ -11,6 +11,7 @@ use crate::edge::app::{
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
 use crate::edge::plant::identities;
+use crate::edge::reports::Reporter;
 use crate::edge::secrets::Secrets;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::Event;
@@ -87,6 +88,7 @@ impl App {
         keys: Keys,
         secrets: Secrets,
     ) -> anyhow::Result<()> {
+        let _change = Reporter::change(&self.reporter);
         self.reporter.replace(Vec::new());
         end_buses(&self.runtime, self.plant.buses());
         self.plant.mailbox().change(|outbox| outbox.take_back_everything());
@@ -129,6 +131,7 @@ impl App {
             let mut fates = parts.buses.iter();
             fates.any(|(bus, fate)| bus == name && matches!(fate, Fate::Stays { .. }))
         };
+        let _change = Reporter::change(&self.reporter);
         // Nobody asks a bus that is about to end, and takes its silence for a fault.
         self.reporter.keep(stays);
         let ending: Vec<String> = running.keys().filter(|name| !stays(name)).cloned().collect();

@@ -1,5 +1,6 @@
 //! Asks every bus how it is, and notices the one that does not answer.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::oneshot;
@@ -63,6 +64,17 @@ pub struct Reporter {
     buses: Mutex<Vec<Arc<Watched>>>,
     /// Why the newest configuration is not the one that runs.
     configuration_error: Mutex<Option<String>>,
+    /// How many changes are at work. Not all buses are there meanwhile.
+    changes: AtomicUsize,
+}
+
+/// As long as this is kept, what is reported is not to be told: not all buses are there.
+pub struct Change(Arc<Reporter>);
+
+impl Drop for Change {
+    fn drop(&mut self) {
+        self.0.changes.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 impl Reporter {
@@ -70,7 +82,22 @@ impl Reporter {
         broker: impl Fn() -> BrokerReport + Send + Sync + 'static,
         buses: Vec<Arc<Watched>>,
     ) -> Reporter {
-        Reporter { broker: Box::new(broker), buses: Mutex::new(buses), configuration_error: Mutex::default() }
+        Reporter {
+            broker: Box::new(broker),
+            buses: Mutex::new(buses),
+            configuration_error: Mutex::default(),
+            changes: AtomicUsize::new(0),
+        }
+    }
+
+    /// The buses are being exchanged, until the change is dropped.
+    pub fn change(reporter: &Arc<Reporter>) -> Change {
+        reporter.changes.fetch_add(1, Ordering::Relaxed);
+        Change(reporter.clone())
+    }
+
+    pub fn is_changing(&self) -> bool {
+        self.changes.load(Ordering::Relaxed) > 0
     }
 
     /// Other buses are asked from now on.

@@ -1,16 +1,20 @@
 //! Words to readings, and wishes to words.
 //!
 //! Reading: words → field of bits → raw number → `invalid`, names → scale, decimals, offset.
-//! Writing runs the same way back, and refuses with a reason that a person can act on.
+//! Writing (`writing`) runs the same way back.
 //!
 //! What another register decides (case, unit, decimals) comes in as `known`: the raw fields of the
 //! device's points, where they have been read and still hold.
 
+mod writing;
+
+pub use writing::{Limits, Obeyed, encode, limits, obey};
+
 use crate::engine::address::Address;
 use crate::engine::device::{
-    Case, Condition, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Unit, WriteRule,
+    Case, Condition, Decimals, Device, Encoding, Form, Kind, Names, PointIndex, Unit,
 };
-use crate::engine::value::{Decimal, Missing, Reading};
+use crate::engine::value::{Decimal, Missing, Moment, Reading};
 
 /// One point's interpretation as it is now, with everything decided that other registers decide.
 #[derive(Clone, Debug, PartialEq)]
@@ -117,8 +121,7 @@ fn resolve_form<'d>(
     };
     let decimals = match form.kind {
         Kind::F32 | Kind::F64 => form.decimals.map(|_| shift),
-        Kind::Bool => None,
-        kind if kind.is_text() || matches!(form.names, Names::All(_)) => None,
+        _ if !form.is_number() => None,
         _ => Some((form.scale.decimals + shift).max(form.offset.decimals)),
     };
     Ok(Resolved { form, decimals, shift, unit, case })
@@ -299,10 +302,16 @@ fn read_integer(resolved: &Resolved<'_>, raw: i128) -> Reading {
             other => Reading::Missing(Missing::UnknownValue(other)),
         };
     }
-    match to_unit(resolved, raw) {
-        Some(number) => Reading::Number(number),
-        None => Reading::Missing(Missing::NotANumber),
+    let number = to_unit(resolved, raw);
+    if let Some(since) = form.since {
+        // A clock that nobody has set counts from nothing, or has not begun to.
+        let seconds = number
+            .filter(|_| raw != 0)
+            .and_then(|number| number.checked_add(Decimal::integer(since.0.into())));
+        let moment = seconds.and_then(Moment::new);
+        return moment.map_or(Reading::Missing(Missing::NotAMoment), Reading::Moment);
     }
+    number.map_or(Reading::Missing(Missing::NotANumber), Reading::Number)
 }
 
 /// A raw number in the point's unit, with all the digits that scale, decimals and offset give.
@@ -332,236 +341,6 @@ fn read_float(resolved: &Resolved<'_>, raw: f64) -> Reading {
         // Too large for a decimal, so that it has no digits behind the dot anyway.
         None => Reading::Float(text.parse().unwrap_or(value) + 0.0),
     }
-}
-
-/// Between which values a number may be written, in the unit shown.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Limits {
-    pub min: Decimal,
-    pub max: Decimal,
-    /// The finest step that makes a difference; `None` for floats without one.
-    pub step: Option<Decimal>,
-}
-
-/// The limits of a writable number as they are now; `None` for what is no number, or a float
-/// without any.
-pub fn limits(resolved: &Resolved<'_>, rule: &WriteRule) -> Option<Limits> {
-    let form = resolved.form;
-    let resolution = resolved.step();
-    match rule {
-        WriteRule::Range { min, max, step } => {
-            // Where a register gives the decimals, the profile's range is the register's own.
-            let shift = if matches!(form.decimals, Some(Decimals::By(_))) { resolved.shift } else { 0 };
-            let shifted = |number: Decimal| Decimal { decimals: number.decimals + shift, ..number };
-            Some(Limits { min: shifted(*min), max: shifted(*max), step: step.map(shifted).or(resolution) })
-        }
-        WriteRule::Any if matches!(form.names, Names::All(_)) || form.kind == Kind::Bool => None,
-        WriteRule::Any => {
-            let capacity = form.kind.integer_range().and_then(|(low, high)| {
-                let (a, b) = (to_unit(resolved, low)?, to_unit(resolved, high)?);
-                Some(if a.compare(b).is_le() { (a, b) } else { (b, a) })
-            });
-            let (min, max) = measuring_range(resolved).or(capacity)?;
-            Some(Limits { min, max, step: resolution })
-        }
-        WriteRule::Names(_) | WriteRule::Press { .. } => None,
-    }
-}
-
-/// The manual's range in the unit that is shown now: profiles give temperatures in °C.
-fn measuring_range(resolved: &Resolved<'_>) -> Option<(Decimal, Decimal)> {
-    let (mut min, mut max) = resolved.form.range?;
-    if resolved.form.difference {
-        max = max.checked_add(min.negated())?;
-        min = max.negated();
-    }
-    if resolved.unit.as_deref() == Some("°F") {
-        let factor = Decimal { units: 18, decimals: 1 };
-        let zero = Decimal::integer(if resolved.form.difference { 0 } else { 32 });
-        min = min.checked_mul(factor)?.checked_add(zero)?.normalized();
-        max = max.checked_mul(factor)?.checked_add(zero)?.normalized();
-    }
-    Some((min, max))
-}
-
-/// The words that make `text` true for a point, for its whole span: a field of bits as one word not
-/// yet shifted, a value shorter than its span filled up with zeros. `Err` is the rule that the wish
-/// breaks, in words for a person.
-pub fn encode(
-    point: &Point,
-    rule: &WriteRule,
-    resolved: &Resolved<'_>,
-    text: &str,
-) -> Result<Vec<u16>, String> {
-    let form = resolved.form;
-    if let WriteRule::Press { word, .. } = rule {
-        return if text == "PRESS" { Ok(vec![*word]) } else { Err(format!("`{text}` is not `PRESS`")) };
-    }
-    let mut words = if form.kind.is_text() {
-        encode_text(form, text)?
-    } else if form.kind == Kind::Bool {
-        match text {
-            "ON" => vec![1],
-            "OFF" => vec![0],
-            _ => return Err(format!("`{text}` is neither `ON` nor `OFF`")),
-        }
-    } else if let Some(raw) = named_value(form, rule, text)? {
-        encode_integer(form, raw)
-    } else if form.kind.is_float() {
-        encode_float(resolved, rule, text)?
-    } else {
-        encode_integer(form, checked_number(point, resolved, rule, text)?)
-    };
-    let registers = if point.at.span.table().is_bits() { 1 } else { point.at.span.count() as usize };
-    words.resize(registers.max(words.len()), 0);
-    Ok(words)
-}
-
-/// The raw value of a name, if `text` is one that may be written; an error if only names may be.
-fn named_value(form: &Form, rule: &WriteRule, text: &str) -> Result<Option<i128>, String> {
-    let named = form.names.list().iter().find(|(_, name)| name == text);
-    let allowed = |name: &str| match rule {
-        WriteRule::Names(names) => names.iter().any(|allowed| allowed == name),
-        _ => true,
-    };
-    match named {
-        Some((raw, name)) if allowed(name) => Ok(Some(*raw)),
-        _ if matches!(form.names, Names::All(_)) || matches!(rule, WriteRule::Names(_)) => {
-            let names: Vec<String> = form
-                .names
-                .list()
-                .iter()
-                .filter(|(_, name)| allowed(name))
-                .map(|(_, name)| format!("`{name}`"))
-                .collect();
-            Err(format!("`{text}` is none of {}", names.join(", ")))
-        }
-        _ => Ok(None),
-    }
-}
-
-fn checked_number(
-    point: &Point,
-    resolved: &Resolved<'_>,
-    rule: &WriteRule,
-    text: &str,
-) -> Result<i128, String> {
-    let form = resolved.form;
-    let wanted = Decimal::parse(text.trim()).ok_or_else(|| format!("`{text}` is not a number"))?;
-    check_limits(resolved, rule, wanted, text)?;
-    let step = match rule {
-        WriteRule::Range { step: Some(_), .. } => limits(resolved, rule).and_then(|limits| limits.step),
-        _ => None,
-    };
-    let overflow = || format!("`{text}` is too large");
-    let stepped = match step {
-        Some(step) => {
-            let steps = rounded_quotient(wanted, step).ok_or_else(overflow)?;
-            Decimal::integer(steps).checked_mul(step).ok_or_else(overflow)?
-        }
-        None => wanted,
-    };
-    let above_offset = stepped.checked_add(form.offset.negated()).ok_or_else(overflow)?;
-    let resolution = Decimal { units: form.scale.units, decimals: form.scale.decimals + resolved.shift };
-    let raw = rounded_quotient(above_offset, resolution).ok_or_else(overflow)?;
-    let (mut low, mut high) = form.kind.integer_range().ok_or_else(overflow)?;
-    let field_bits = match point.at.bits {
-        Some(bits) => Some(u32::from(bits.width())),
-        None if point.at.span.table().is_bits() => Some(point.at.span.count()),
-        None => None,
-    };
-    if let Some(width) = field_bits {
-        (low, high) = (low.max(0), high.min((1i128 << width) - 1));
-    }
-    if raw < low || raw > high {
-        return Err(format!("`{text}` does not fit the register, which holds {low} to {high}"));
-    }
-    Ok(raw)
-}
-
-fn check_limits(
-    resolved: &Resolved<'_>,
-    rule: &WriteRule,
-    wanted: Decimal,
-    text: &str,
-) -> Result<(), String> {
-    let Some(limits) = limits(resolved, rule) else { return Ok(()) };
-    if wanted.compare(limits.min).is_lt() || wanted.compare(limits.max).is_gt() {
-        return Err(format!("`{text}` is outside {} to {}", limits.min, limits.max));
-    }
-    Ok(())
-}
-
-/// `number ÷ divisor`, rounded to the nearest whole, halves away from zero.
-fn rounded_quotient(number: Decimal, divisor: Decimal) -> Option<i128> {
-    let decimals = number.decimals.max(divisor.decimals);
-    let (a, b) = (number.with_decimals(decimals)?.units, divisor.with_decimals(decimals)?.units);
-    if b == 0 {
-        return None;
-    }
-    let (quotient, rest) = (a / b, a % b);
-    let away = if (a < 0) == (b < 0) { 1 } else { -1 };
-    Some(if rest.unsigned_abs() * 2 >= b.unsigned_abs() { quotient + away } else { quotient })
-}
-
-fn encode_float(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Result<Vec<u16>, String> {
-    let form = resolved.form;
-    let wanted = Decimal::parse(text.trim()).ok_or_else(|| format!("`{text}` is not a number"))?;
-    check_limits(resolved, rule, wanted, text)?;
-    let register = (wanted.to_f64() - form.offset.to_f64()) / form.scale.to_f64();
-    let finite =
-        |fits: bool| if fits { Ok(()) } else { Err(format!("`{text}` is too large for the register")) };
-    let bytes = if form.kind == Kind::F32 {
-        finite((register as f32).is_finite())?;
-        (register as f32).to_be_bytes().to_vec()
-    } else {
-        finite(register.is_finite())?;
-        register.to_be_bytes().to_vec()
-    };
-    let words = bytes.chunks(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
-    Ok(in_wire_order(form, words))
-}
-
-fn encode_integer(form: &Form, raw: i128) -> Vec<u16> {
-    let bits = match form.kind {
-        Kind::Bcd16 | Kind::Bcd32 => u64::from_str_radix(&raw.to_string(), 16).unwrap_or(0),
-        _ => raw as u64,
-    };
-    let count = form.kind.registers();
-    let words = (0..count).rev().map(|index| (bits >> (16 * index)) as u16).collect();
-    in_wire_order(form, words)
-}
-
-fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
-    match form.kind {
-        Kind::LetterNumber => {
-            let letter = text.bytes().next().filter(u8::is_ascii_alphabetic);
-            let number = text.get(1..).and_then(|digits| digits.parse::<u8>().ok());
-            match (letter, number) {
-                (Some(letter), Some(number)) => {
-                    Ok(in_wire_order(form, vec![u16::from_be_bytes([letter, number])]))
-                }
-                _ => Err(format!("`{text}` is not a letter and a number from 0 to 255, as in `R017`")),
-            }
-        }
-        Kind::Text { registers } => {
-            let room = usize::from(registers) * 2;
-            if text.len() > room || text.contains(char::is_control) {
-                return Err(format!("`{text}` is longer than {room} bytes or has control characters"));
-            }
-            let mut bytes = text.as_bytes().to_vec();
-            bytes.resize(room, 0);
-            let swap = form.order.swaps_bytes();
-            let word = |pair: &[u8]| u16::from_be_bytes([pair[0], pair[1]]);
-            Ok(bytes.chunks(2).map(|pair| if swap { word(pair).swap_bytes() } else { word(pair) }).collect())
-        }
-        _ => Err("a date cannot be written".to_string()),
-    }
-}
-
-/// The inverse of [`most_significant_first`], which is its own inverse.
-fn in_wire_order(form: &Form, words: Vec<u16>) -> Vec<u16> {
-    most_significant_first(form, &words)
 }
 
 #[cfg(test)]

@@ -2,8 +2,9 @@
 
 use super::*;
 use crate::engine::address::{Address, Bits, Span, Table};
-use crate::engine::device::{Order, Point, Poll, Write};
+use crate::engine::device::{Order, OutOfRange, Point, Poll, Write, WriteRule};
 use crate::engine::test_device::device_of;
+use crate::engine::time::Date;
 
 fn decimal(text: &str) -> Decimal {
     Decimal::parse(text).expect("a decimal in a test")
@@ -125,6 +126,30 @@ fn texts_codes_and_dates() {
 }
 
 #[test]
+fn seconds_since_a_day_are_a_moment() {
+    let since = |kind, year: u64| with(kind, |form| form.since = Date::of_day(year, 1, 1));
+    check_read(since(Kind::U32, 1970), "6B09 13F0", "2026-11-27T05:24:00+00:00");
+    check_read(since(Kind::U64, 1970), "0000 0000 6B09 13F0", "2026-11-27T05:24:00+00:00");
+    check_read(since(Kind::U32, 2000), "3296 6E5A", "2026-11-23T03:24:10+00:00");
+    // Of milliseconds; of days.
+    let scaled = |scale: &str, kind| Form { scale: decimal(scale), ..since(kind, 1970) };
+    check_read(scaled("0.001", Kind::U48), "01A1 6A5B E1C2", "2026-10-23T20:02:48.898+00:00");
+    check_read(scaled("86400", Kind::U16), "5130", "2026-11-27T00:00:00+00:00");
+    // Nobody has set the clock; before 1970; behind what there are dates for.
+    check_read(since(Kind::U32, 1970), "0000 0000", "None");
+    check_read(since(Kind::I32, 1970), "FFFF FFFF", "None");
+    check_read(since(Kind::U64, 1970), "FFFF FFFF FFFF FFFF", "None");
+    let invalid = Form { invalid: vec![(0xFFFF_FFFF, "not set".into())], ..since(Kind::U32, 1970) };
+    check_read(invalid, "FFFF FFFF", "None");
+    check_write(
+        since(Kind::U32, 1970),
+        WriteRule::Any,
+        "2026-11-27T05:24:00+00:00",
+        Err("a moment cannot be written"),
+    );
+}
+
+#[test]
 fn a_wish_is_checked_rounded_and_encoded() {
     let seconds = with(Kind::U16, |form| form.scale = decimal("0.01"));
     let range = |min: &str, max: &str, step: Option<&str>| WriteRule::Range {
@@ -144,7 +169,14 @@ fn a_wish_is_checked_rounded_and_encoded() {
     check_write(seconds.clone(), watchdog.clone(), "1,5", Err("`1,5` is not a number"));
     check_write(seconds, watchdog, "None", Err("`None` is not a number"));
     let half_steps = with(Kind::U16, |form| form.decimals = Some(Decimals::Fixed(1)));
-    check_write(half_steps, range("4", "20", Some("0.5")), "4.3", Ok("002D"));
+    check_write(half_steps.clone(), range("4", "20", Some("0.5")), "4.3", Ok("002D"));
+    check_write(half_steps.clone(), range("4", "20", Some("0.5")), "4.500000000000001", Ok("002D"));
+    // Steps begin at the smallest value, and end before the largest where that is between two.
+    check_write(half_steps.clone(), range("1", "9.8", Some("2")), "4.1", Ok("0032"));
+    check_write(half_steps, range("1", "9.8", Some("2")), "9.8", Ok("005A"));
+    let thirds = with(Kind::U16, |form| form.scale = decimal("0.3"));
+    check_write(thirds.clone(), range("0", "10.4", None), "10.4", Ok("0022"));
+    check_write(thirds, range("0.2", "10.4", None), "0.3", Ok("0001"));
     check_write(Form::new(Kind::I16), WriteRule::Any, "-32768", Ok("8000"));
     check_write(Form::new(Kind::I16), WriteRule::Any, "32768", Err("`32768` is outside -32768 to 32767"));
     check_write(Form::new(Kind::U48), WriteRule::Any, "281474976710655", Ok("FFFF FFFF FFFF"));
@@ -210,4 +242,57 @@ fn the_digits_shown_are_those_that_one_step_of_the_register_moves() {
         let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
         assert_eq!(resolved.display_precision(), Some(expected), "{scale} {shift}");
     }
+}
+
+#[test]
+fn what_is_made_of_a_wish_is_said() {
+    let tenths = with(Kind::I16, |form| {
+        form.decimals = Some(Decimals::Fixed(1));
+        form.names = Names::Some(vec![(11111, "automatic".into())]);
+    });
+    let range = |step: Option<&str>| WriteRule::Range {
+        min: decimal("-5"),
+        max: decimal("30"),
+        step: step.map(decimal),
+    };
+    let (half, any) = (range(Some("0.5")), range(None));
+    let (refuse, clamp) = (OutOfRange::Refuse, OutOfRange::Clamp);
+    for (rule, out_of_range, text, expected) in [
+        (&any, refuse, "21.5", Ok(("00D7", None))),
+        (&any, refuse, "21.0", Ok(("00D2", None))),
+        (&any, refuse, "automatic", Ok(("2B67", None))),
+        // What a calculation with floats leaves is nothing to speak of.
+        (&any, refuse, "21.400000000000002", Ok(("00D6", None))),
+        (&any, refuse, "0.30000000000000004", Ok(("0003", None))),
+        (&any, refuse, "21.44", Ok(("00D6", Some("`21.44` is rounded to 21.4")))),
+        (&any, refuse, "1e-05", Ok(("0000", Some("`1e-05` is rounded to 0.0")))),
+        (&half, refuse, "21.3", Ok(("00D7", Some("`21.3` is rounded to 21.5")))),
+        (&any, refuse, "30.1", Err("`30.1` is outside -5 to 30")),
+        (&any, clamp, "30.0", Ok(("012C", None))),
+        (&any, clamp, "30.1", Ok(("012C", Some("`30.1` is out of range, and 30.0 the nearest value in it")))),
+        (
+            &half,
+            clamp,
+            "-1e6",
+            Ok(("FFCE", Some("`-1e6` is out of range, and -5.0 the nearest value in it"))),
+        ),
+        (&any, clamp, "automatic", Ok(("2B67", None))),
+        (&any, clamp, "nan", Err("`nan` is not a number")),
+    ] {
+        let mut device = device(tenths.clone(), registers(1), rule.clone());
+        let mut write = device.points[0].write.take().expect("it is written");
+        write.out_of_range = out_of_range;
+        let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+        let found = obey(&device.points[0], &write, &resolved, text);
+        let expected = expected.map_err(str::to_string);
+        let expected =
+            expected.map(|(hex, note)| Obeyed { words: words(hex), note: note.map(str::to_string) });
+        assert_eq!(found, expected, "{text} {out_of_range:?}");
+    }
+    // A float is as exact as a float is.
+    let mut float = device(Form::new(Kind::F32), registers(2), WriteRule::Any);
+    let write = float.points[0].write.take().expect("it is written");
+    let resolved = resolve(&float, 0, &[None]).expect("a plain form resolves");
+    let found = obey(&float.points[0], &write, &resolved, "21.1");
+    assert_eq!(found, Ok(Obeyed { words: words("41A8 CCCD"), note: None }));
 }

@@ -5,6 +5,10 @@
 //! device holds is read, and decides. The state topic is none of this module's business: it shows
 //! only what reads found.
 
+mod wish;
+
+pub use wish::Wish;
+
 use crate::engine::address::{Address, Span};
 use crate::engine::codec;
 use crate::engine::device::{Device, Names, Point, PointIndex, Write, WriteFunction, WriteRule};
@@ -16,6 +20,8 @@ use crate::engine::time::Duration;
 pub struct CommandFlow {
     point: PointIndex,
     wanted: String,
+    /// What was made of the wish, where it is not written as it is.
+    note: Option<String>,
     state: State,
     /// The last question, and how often the device was too busy for it.
     asked: Option<Call>,
@@ -71,6 +77,8 @@ pub struct Outcome {
     /// What the device holds, as far as it is known.
     pub found: Option<String>,
     pub reason: Option<String>,
+    /// As it came with the wish.
+    pub transaction: Option<serde_json::Value>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,31 +110,36 @@ impl OutcomeKind {
     }
 }
 
-/// More bytes than any value has: the longest text fills 125 registers. What is longer is no value, and is not
-/// repeated in an outcome, which no broker would take.
-const WISH_BYTES_MAX: usize = 1024;
-
 impl Outcome {
     pub fn new(kind: OutcomeKind, wanted: &str, reason: impl Into<String>) -> Outcome {
-        Outcome { kind, wanted: shortened(wanted), found: None, reason: Some(reason.into()) }
+        Outcome {
+            kind,
+            wanted: shortened(wanted),
+            found: None,
+            reason: Some(reason.into()),
+            transaction: None,
+        }
     }
 
     /// Why `wanted` is not even looked at, if it is too long to be a value.
     pub fn of_too_long(wanted: &str) -> Option<Outcome> {
         let bytes = wanted.len();
-        let reason = || format!("{bytes} bytes are no value; expected at most {WISH_BYTES_MAX}");
-        (bytes > WISH_BYTES_MAX).then(|| Outcome::new(OutcomeKind::Refused, wanted, reason()))
+        let reason = || format!("{bytes} bytes are no value; expected at most {}", wish::BYTES_MAX);
+        (bytes > wish::BYTES_MAX).then(|| Outcome::new(OutcomeKind::Refused, wanted, reason()))
     }
 
-    /// `{"outcome":"done","wanted":"ON","found":"ON","reason":null}`
+    /// `{"outcome":"done","wanted":"ON","found":"ON","reason":null}`, and the `transaction` if one came.
     pub fn to_json(&self) -> String {
-        serde_json::json!({
+        let mut json = serde_json::json!({
             "outcome": self.kind.name(),
             "wanted": self.wanted,
             "found": self.found,
             "reason": self.reason,
-        })
-        .to_string()
+        });
+        if let Some(transaction) = &self.transaction {
+            json["transaction"] = transaction.clone();
+        }
+        json.to_string()
     }
 }
 
@@ -145,16 +158,16 @@ impl CommandFlow {
         let Some(write) = &details.write else {
             return refuse(format!("`{}` is read-only", details.name));
         };
-        let field = match codec::resolve(device, point, known) {
-            Ok(resolved) => match codec::encode(details, &write.rule, &resolved, wanted) {
-                Ok(field) => field,
+        let codec::Obeyed { words: field, note } = match codec::resolve(device, point, known) {
+            Ok(resolved) => match codec::obey(details, write, &resolved, wanted) {
+                Ok(obeyed) => obeyed,
                 Err(reason) => return refuse(reason),
             },
             Err(missing) => return refuse(missing.to_string()),
         };
         let flow = |state, call: &Call| {
-            let (wanted, asked) = (wanted.to_string(), Some(call.clone()));
-            CommandFlow { point, wanted, state, asked, busy: 0 }
+            let (wanted, note, asked) = (wanted.to_string(), note.clone(), Some(call.clone()));
+            CommandFlow { point, wanted, note, state, asked, busy: 0 }
         };
         let compares = details.persistent && !is_press(write);
         let reads_before = compares || write.at.bits.is_some() || write.on_change.is_some();
@@ -390,13 +403,17 @@ impl CommandFlow {
     }
 
     fn finish(&self, kind: OutcomeKind, found: Option<String>, reason: Option<String>) -> Step {
-        Step::Finished(Outcome { kind, wanted: self.wanted.clone(), found, reason })
+        let reason = match (reason, &self.note) {
+            (Some(reason), Some(note)) => Some(format!("{reason}; {note}")),
+            (reason, note) => reason.or_else(|| note.clone()),
+        };
+        Step::Finished(Outcome { kind, wanted: self.wanted.clone(), found, reason, transaction: None })
     }
 }
 
 /// As it is, or the beginning of what is too long.
 fn shortened(wanted: &str) -> String {
-    if wanted.len() <= WISH_BYTES_MAX {
+    if wanted.len() <= wish::BYTES_MAX {
         return wanted.to_string();
     }
     let beginning: String = wanted.chars().take(100).collect();
@@ -468,7 +485,7 @@ mod tests {
 
     #[test]
     fn what_is_too_long_to_be_a_value_is_refused_and_not_repeated_as_a_whole() {
-        assert_eq!(Outcome::of_too_long(&"7".repeat(WISH_BYTES_MAX)), None);
+        assert_eq!(Outcome::of_too_long(&"7".repeat(wish::BYTES_MAX)), None);
         let outcome = Outcome::of_too_long(&"ß".repeat(5_000_000)).expect("it is refused");
         assert_eq!(outcome.kind, OutcomeKind::Refused);
         assert_eq!(outcome.wanted, format!("{}…", "ß".repeat(100)));

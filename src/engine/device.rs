@@ -7,7 +7,7 @@ mod thing;
 pub use thing::{PRESS, State, Thing, ThingCommand, ThingKind};
 
 use crate::engine::address::{Address, Span};
-use crate::engine::time::Duration;
+use crate::engine::time::{Date, Duration};
 use crate::engine::value::Decimal;
 
 /// Index into [`Device::points`].
@@ -200,6 +200,18 @@ impl Point {
         self.write.as_ref().is_some_and(|write| matches!(write.rule, WriteRule::Press { .. }))
     }
 
+    /// Whether numbers are written to it, in one case at least.
+    pub fn takes_numbers(&self) -> bool {
+        let rule = self.write.as_ref().map(|write| &write.rule);
+        let is_number = match &self.encoding {
+            Encoding::Plain(form) => form.is_number(),
+            Encoding::Cases { cases, .. } => {
+                cases.iter().filter_map(|case| case.form.as_ref()).any(Form::is_number)
+            }
+        };
+        is_number && matches!(rule, Some(WriteRule::Any | WriteRule::Range { .. }))
+    }
+
     /// The one interpretation, for a point without cases.
     pub fn plain(&self) -> Option<&Form> {
         match &self.encoding {
@@ -302,6 +314,8 @@ pub struct Form {
     pub scale: Decimal,
     pub offset: Decimal,
     pub decimals: Option<Decimals>,
+    /// The value counts seconds since then and stands for a moment.
+    pub since: Option<Date>,
     pub unit: Unit,
     /// A difference between two values (an offset, a hysteresis): 5 K are not 41 °F.
     pub difference: bool,
@@ -325,6 +339,7 @@ impl Form {
             scale: Decimal::ONE,
             offset: Decimal::ZERO,
             decimals: None,
+            since: None,
             unit: Unit::None,
             difference: false,
             names: Names::None,
@@ -332,6 +347,12 @@ impl Form {
             invalid: Vec::new(),
             range: None,
         }
+    }
+
+    /// Whether it is a quantity, of which some values may have names: nothing else has a unit or digits.
+    pub fn is_number(&self) -> bool {
+        let is_enumeration = matches!(self.names, Names::All(_));
+        self.kind != Kind::Bool && !self.kind.is_text() && !is_enumeration && self.since.is_none()
     }
 }
 
@@ -495,11 +516,37 @@ pub struct Write {
     pub settle: Duration,
     /// The device acts only when the content changes: this register value stands between two equal ones.
     pub on_change: Option<i128>,
+    pub out_of_range: OutOfRange,
 }
 
 impl Write {
     pub fn new(at: Address, rule: WriteRule) -> Write {
-        Write { at, with: None, rule, settle: Duration::ZERO, on_change: None }
+        Write {
+            at,
+            with: None,
+            rule,
+            settle: Duration::ZERO,
+            on_change: None,
+            out_of_range: OutOfRange::Refuse,
+        }
+    }
+}
+
+/// What becomes of a command with a number beyond the limits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum OutOfRange {
+    #[default]
+    Refuse,
+    /// The limit is written, and the outcome says so.
+    Clamp,
+}
+
+impl OutOfRange {
+    pub const fn name(self) -> &'static str {
+        match self {
+            OutOfRange::Refuse => "refuse",
+            OutOfRange::Clamp => "clamp",
+        }
     }
 }
 

@@ -9,7 +9,7 @@ use std::sync::{Arc, Weak};
 use serde_json::{Map, Value as Json, json};
 
 use crate::engine::address::Span;
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::command::{self, Outcome, OutcomeKind};
 use crate::engine::device::Identify;
 use crate::engine::profile::Library;
 use crate::engine::settings::{Link, Settings};
@@ -256,7 +256,8 @@ impl Desk {
     /// The outcome of a message on a `set` topic that is for no bus: of no device, or too long to be a value.
     pub fn refusal_of_set(&self, device: &str, wanted: &str) -> Option<Outcome> {
         if !self.bus_of.contains_key(device) {
-            return Some(Outcome::new(OutcomeKind::Refused, wanted, self.no_device(device)));
+            let reason = self.no_device(device);
+            return Some(command::Wish::parse(wanted).ended(OutcomeKind::Refused, reason));
         }
         Outcome::of_too_long(wanted)
     }

@@ -349,6 +349,7 @@ fn differs(told: &Reading, reading: &Reading, point: &Point) -> bool {
     let number = |reading: &Reading| match reading {
         Reading::Number(number) => Some(number.to_f64()),
         Reading::Float(number) => Some(*number),
+        Reading::Moment(moment) => Some(moment.seconds().to_f64()),
         _ => None,
     };
     match (number(told), number(reading), point.deadband) {

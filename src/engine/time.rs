@@ -53,6 +53,32 @@ impl fmt::Display for Time {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Date(pub u64);
 
+impl Date {
+    /// The beginning of a day, which is there in no calendar where this is `None`.
+    pub fn of_day(year: u64, month: u64, day: u64) -> Option<Date> {
+        let years: u64 = (1970..year.min(Date::YEARS_END)).map(days_of_year).sum();
+        let lengths = days_of_months(year);
+        let length = *lengths.get(usize::try_from(month.checked_sub(1)?).ok()?)?;
+        let months: u64 = lengths.iter().take(month as usize - 1).sum();
+        let is_there = (1970..Date::YEARS_END).contains(&year) && (1..=length).contains(&day);
+        is_there.then(|| Date((years + months + day - 1) * 86_400))
+    }
+
+    /// The year that no date is in any more: what other programs take has four digits.
+    const YEARS_END: u64 = 10_000;
+    /// As many seconds have passed when that year begins.
+    pub const SECONDS_END: u64 = 253_402_300_800;
+}
+
+fn days_of_months(year: u64) -> [u64; 12] {
+    let leap = year % 4 == 0 && (year % 100 != 0 || year % 400 == 0);
+    [31, 28 + u64::from(leap), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31]
+}
+
+fn days_of_year(year: u64) -> u64 {
+    days_of_months(year).iter().sum()
+}
+
 impl Add<Duration> for Date {
     type Output = Date;
     fn add(self, duration: Duration) -> Date {
@@ -64,14 +90,13 @@ impl fmt::Display for Date {
     /// RFC 3339: `2026-11-26T23:50:21Z`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (days, second) = (self.0 / 86_400, self.0 % 86_400);
-        let leap = |year: u64| year % 4 == 0 && (year % 100 != 0 || year % 400 == 0);
         let (mut year, mut day) = (1970, days);
-        while day >= 365 + u64::from(leap(year)) {
-            day -= 365 + u64::from(leap(year));
+        while day >= days_of_year(year) {
+            day -= days_of_year(year);
             year += 1;
         }
         let mut month = 1;
-        for length in [31, 28 + u64::from(leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31] {
+        for length in days_of_months(year) {
             if day < length {
                 break;
             }
@@ -98,6 +123,28 @@ mod tests {
             (1_795_737_021, "2026-11-26T23:50:21Z"),
         ] {
             assert_eq!(Date(seconds).to_string(), expected);
+        }
+        assert_eq!(Date(Date::SECONDS_END).to_string(), "10000-01-01T00:00:00Z");
+    }
+
+    #[test]
+    fn a_day_is_one_of_the_calendar() {
+        for (day, expected) in [
+            ((1970, 1, 1), Some("1970-01-01T00:00:00Z")),
+            ((2000, 2, 29), Some("2000-02-29T00:00:00Z")),
+            ((2026, 11, 27), Some("2026-11-27T00:00:00Z")),
+            ((9999, 12, 31), Some("9999-12-31T00:00:00Z")),
+            ((1969, 12, 31), None),
+            ((2100, 2, 29), None),
+            ((2026, 0, 1), None),
+            ((2026, 13, 1), None),
+            ((2026, 4, 31), None),
+            ((2026, 4, 0), None),
+            ((10_000, 1, 1), None),
+        ] {
+            let (year, month, date) = day;
+            let found = Date::of_day(year, month, date).map(|date| date.to_string());
+            assert_eq!(found.as_deref(), expected, "{day:?}");
         }
     }
 }

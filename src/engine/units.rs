@@ -59,6 +59,46 @@ pub fn check(
     }
 }
 
+/// Whether a sensor's device class and state class go with what its values are: a number, a moment, a name or a
+/// text. Home Assistant would log an error for each value.
+pub fn check_sense(
+    platform: Platform,
+    form: &Form,
+    class: Option<&str>,
+    state_class: Option<&str>,
+) -> Result<(), String> {
+    if platform != Platform::Sensor {
+        return Ok(());
+    }
+    let is_enumeration = matches!(form.names, Names::All(_));
+    let what = match form {
+        _ if form.is_number() => "a number",
+        _ if form.since.is_some() => "a moment",
+        _ if is_enumeration => "one of several names",
+        _ => "a text",
+    };
+    if let Some(state_class) = state_class.filter(|_| !form.is_number()) {
+        return Err(format!("state class `{state_class}` is for numbers, but this is {what}; leave it out"));
+    }
+    let Some(class) = class else { return Ok(()) };
+    let remedy = match class {
+        "timestamp" | "uptime" if form.since.is_some() => return Ok(()),
+        "timestamp" | "uptime" => {
+            "expected `since: 1970-01-01` at the point, if its register counts seconds from there"
+        }
+        "enum" if is_enumeration => return Ok(()),
+        "enum" => "expected `values` at the point, or no `device_class`",
+        class if form.is_number() && class != "date" => return Ok(()),
+        _ => "leave `device_class` out",
+    };
+    Err(format!("device class `{class}` does not go with {what}; {remedy}"))
+}
+
+/// The device class of what is no number: a moment is a `timestamp`.
+pub fn class_of_sense(form: &Form) -> Option<&'static str> {
+    form.since.map(|_| "timestamp")
+}
+
 /// The device class that a unit leaves no doubt about: `°C` is a temperature, but `%` may be a
 /// humidity, a battery or a valve. `difference` as in [`crate::engine::device::Form::difference`].
 pub fn class_of_unit(unit: &str, difference: bool) -> Option<&'static str> {
@@ -386,6 +426,7 @@ const CLASSES: &[Class] = &[
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::time::Date;
 
     #[track_caller]
     fn check_wish(
@@ -439,6 +480,39 @@ mod tests {
         for (platform, wish, expected) in bad {
             check_wish(platform, wish, Err(expected));
         }
+    }
+
+    #[test]
+    fn a_class_goes_with_what_the_values_are() {
+        let number = Form::new(Kind::U32);
+        let moment = Form { since: Some(Date(0)), ..number.clone() };
+        let names = Form { names: Names::All(vec![(0, "off".into())]), ..number.clone() };
+        let text = Form::new(Kind::Text { registers: 4 });
+        let date = Form::new(Kind::DayMonthYear);
+        for (form, class, state_class, expected) in [
+            (&number, Some("energy"), Some("total"), ""),
+            (&number, Some("timestamp"), None, "expected `since: 1970-01-01` at the point"),
+            (&number, Some("enum"), None, "does not go with a number; expected `values`"),
+            (&number, Some("date"), None, "does not go with a number; leave `device_class` out"),
+            (&moment, Some("timestamp"), None, ""),
+            (&moment, Some("uptime"), None, ""),
+            (&moment, Some("duration"), None, "does not go with a moment; leave `device_class` out"),
+            (&moment, None, Some("measurement"), "is for numbers, but this is a moment"),
+            (&names, Some("enum"), None, ""),
+            (&names, Some("power"), None, "does not go with one of several names"),
+            (&text, Some("timestamp"), None, "expected `since: 1970-01-01`"),
+            (&text, Some("temperature"), None, "does not go with a text"),
+            // The year is one digit: which decade it is of, the register does not say.
+            (&date, Some("date"), None, "does not go with a text"),
+        ] {
+            let found = check_sense(Platform::Sensor, form, class, state_class);
+            let is_expected = match &found {
+                Ok(()) => expected.is_empty(),
+                Err(message) => !expected.is_empty() && message.contains(expected),
+            };
+            assert!(is_expected, "{class:?} {state_class:?}: {found:?} instead of {expected:?}");
+        }
+        assert_eq!(check_sense(Platform::Number, &number, Some("power"), None), Ok(()));
     }
 
     #[test]

@@ -1,4 +1,8 @@
-//! What a reading is: a number, a flag, a name, a text, or missing with a reason.
+//! What a reading is: a number, a moment, a flag, a name, a text, or missing with a reason.
+
+mod moment;
+
+pub use moment::Moment;
 
 use std::fmt;
 
@@ -145,6 +149,8 @@ pub enum Reading {
     Number(Decimal),
     /// From floating-point registers; always finite.
     Float(f64),
+    /// When something was or will be.
+    Moment(Moment),
     Flag(bool),
     /// A named value: `automatic`, `°C`.
     Name(String),
@@ -176,6 +182,8 @@ pub enum Missing {
     /// It held a text without a letter. Told as such it would be no value on MQTT: an empty message deletes what
     /// the broker keeps, and Home Assistant passes over it.
     EmptyText,
+    /// The register that counts seconds held 0, or more than there is a date for.
+    NotAMoment,
     /// The device answered the read with this exception.
     Exception(u8),
     /// The device leaves the read without an answer, while it answers others; what came instead.
@@ -195,6 +203,7 @@ impl Missing {
             Missing::NotANumber => "not_a_number",
             Missing::NotText => "not_text",
             Missing::EmptyText => "empty_text",
+            Missing::NotAMoment => "not_a_moment",
             Missing::Exception(_) => "exception",
             Missing::Unanswered(_) => "unanswered",
         }
@@ -213,6 +222,7 @@ impl fmt::Display for Missing {
             Missing::NotANumber => write!(f, "not a number"),
             Missing::NotText => write!(f, "not a text"),
             Missing::EmptyText => write!(f, "an empty text"),
+            Missing::NotAMoment => write!(f, "no date and time"),
             Missing::Exception(code) => write!(f, "exception {code}"),
             Missing::Unanswered(error) => write!(f, "{error}, again and again"),
         }
@@ -220,12 +230,12 @@ impl fmt::Display for Missing {
 }
 
 impl Reading {
-    /// As a JSON value: numbers with their digits, `"ON"` and `"OFF"`, names and texts, `null` where there is
-    /// none.
+    /// As a JSON value: numbers with their digits, `"ON"` and `"OFF"`, moments, names and texts, `null` where
+    /// there is none.
     pub fn to_json(&self) -> String {
         match self {
             Reading::Number(_) | Reading::Float(_) => self.to_string(),
-            Reading::Flag(_) | Reading::Name(_) | Reading::Text(_) => {
+            Reading::Moment(_) | Reading::Flag(_) | Reading::Name(_) | Reading::Text(_) => {
                 serde_json::Value::from(self.to_string()).to_string()
             }
             Reading::List(readings) => {
@@ -238,11 +248,12 @@ impl Reading {
 }
 
 impl fmt::Display for Reading {
-    /// The text published on MQTT: `21.5`, `ON`, `automatic`, `[0.1,null]`, `None`.
+    /// The text published on MQTT: `21.5`, `2026-11-27T05:24:00+00:00`, `ON`, `automatic`, `[0.1,null]`, `None`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Reading::Number(number) => write!(f, "{number}"),
             Reading::Float(number) => write!(f, "{number}"),
+            Reading::Moment(moment) => write!(f, "{moment}"),
             Reading::Flag(true) => write!(f, "ON"),
             Reading::Flag(false) => write!(f, "OFF"),
             Reading::Name(name) => write!(f, "{name}"),
@@ -290,6 +301,7 @@ mod tests {
     #[test]
     fn a_reading_is_json_with_its_digits() {
         let number = |text| Reading::Number(Decimal::parse(text).expect("a decimal"));
+        let moment = Moment::new(Decimal::integer(1_795_757_040)).expect("a moment");
         let list = Reading::List(vec![number("0.10"), Reading::Missing(Missing::NotANumber)]);
         for (reading, expected) in [
             (number("21.50"), "21.50"),
@@ -297,6 +309,7 @@ mod tests {
             (number("18446744073709551615"), "18446744073709551615"),
             (Reading::Float(0.00001), "0.00001"),
             (Reading::Float(20.0), "20"),
+            (Reading::Moment(moment), "\"2026-11-27T05:24:00+00:00\""),
             (Reading::Flag(true), "\"ON\""),
             (Reading::Name("50 % \"A\"".into()), "\"50 % \\\"A\\\"\""),
             (Reading::Text("21".into()), "\"21\""),

@@ -1,8 +1,8 @@
 //! The expanded points as a table for people, with the long lists below it.
 
 use busker::engine::device::{
-    Condition, Decimals, Device, Encoding, Form, Kind, Names, Point, PointIndex, Thing, Unit, Write,
-    WriteFunction, WriteRule,
+    Condition, Decimals, Device, Encoding, Form, Kind, Names, OutOfRange, Point, PointIndex, Thing, Unit,
+    Write, WriteFunction, WriteRule,
 };
 use busker::engine::time::Duration;
 use busker::engine::value::Decimal;
@@ -82,6 +82,9 @@ fn meaning(device: &Device, form: &Form, lists: &mut Vec<String>) -> String {
     if form.offset != Decimal::ZERO {
         words.push(format!("+ {}", form.offset));
     }
+    if let Some(since) = form.since {
+        words.push(format!("seconds since {since}"));
+    }
     match &form.unit {
         Unit::Fixed(unit) => words.push(unit.clone()),
         Unit::By(point) => words.push(format!("unit of {}", device.points[*point].name)),
@@ -134,6 +137,9 @@ fn writing(point: &Point, write: &Write) -> String {
     }
     if let Some(function) = write.with {
         words.push(format!("with function {}", WriteFunction::code(function)));
+    }
+    if write.out_of_range == OutOfRange::Clamp {
+        words.push("or the nearest of it".into());
     }
     if let Some(between) = write.on_change {
         words.push(format!("with {between} between two equal ones"));

@@ -69,8 +69,10 @@ class Announced:
 
     @property
     def kind(self) -> str:
-        """As the tables call it: a sensor of named values is an `enum`."""
-        return "enum" if self.component.get("device_class") == "enum" else self.platform
+        """As the tables call it: a sensor of named values is an `enum`, one of a moment a `timestamp`."""
+        device_class = self.component.get("device_class")
+        is_special = self.platform == "sensor" and device_class in ("enum", "timestamp", "duration")
+        return device_class if is_special else self.platform
 
     def payload(self, topic: str = "state_topic") -> str | None:
         """The retained message; `None` also where it says so."""

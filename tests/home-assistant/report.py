@@ -3,8 +3,8 @@
 import collections
 import pathlib
 
-KINDS = ("sensor", "enum", "binary_sensor", "switch", "number", "select", "button", "text", "event",
-         "cover", "valve", "climate")
+KINDS = ("sensor", "enum", "timestamp", "duration", "binary_sensor", "switch", "number", "select", "button", "text",
+         "event", "cover", "valve", "climate")
 BEGIN = "<!-- What follows is written by `BLESS=1 make test-home-assistant VERSION={}`. -->\n"
 END = "<!-- So far. -->\n"
 

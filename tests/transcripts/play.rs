@@ -426,8 +426,12 @@ fn summary(topic: &str, payload: &str) -> String {
             Some(0) => String::new(),
             _ => format!(", drift {}", info["drift"]),
         };
+        let eeprom = &info["eeprom"];
+        let is_held_back =
+            eeprom["spent"] == true || eeprom["waiting"].as_object().is_some_and(|all| !all.is_empty());
+        let eeprom = if is_held_back { format!(", eeprom {eeprom}") } else { String::new() };
         return format!(
-            "online {}, reason {}, missing {}{drift}",
+            "online {}, reason {}, missing {}{drift}{eeprom}",
             info["online"], info["reason"], info["missing"]
         );
     }

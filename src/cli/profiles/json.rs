@@ -9,6 +9,7 @@ use crate::engine::device::{
     WriteRule,
 };
 use crate::engine::homeassistant::entity;
+use crate::engine::time::Date;
 use crate::engine::value::Decimal;
 
 /// One line of `profiles list`.
@@ -159,6 +160,9 @@ fn point(device: &Device, index: PointIndex) -> Json {
     // Beside the macro, which takes no more keys.
     let ranges = point.ranges.iter().map(|(name, form)| (name.clone(), form_json(device, form)));
     json["ranges"] = ranges.collect::<Map<_, _>>().into();
+    json["out_of_range"] =
+        write.filter(|_| point.takes_numbers()).map(|write| write.out_of_range.name()).into();
+    json["since"] = plain.and_then(|form| form.since).map(since).into();
     json
 }
 
@@ -206,6 +210,11 @@ fn thing_json(device: &Device, thing: &Thing) -> Json {
     })
 }
 
+/// The day that a moment is counted from.
+fn since(date: Date) -> String {
+    date.to_string().chars().take_while(|character| *character != 'T').collect()
+}
+
 fn case_json(device: &Device, case: &Case) -> Json {
     let Some(form) = &case.form else { return Json::Null };
     let mut json = form_json(device, form);
@@ -222,6 +231,7 @@ fn form_json(device: &Device, form: &Form) -> Json {
         "unit": unit(form),
         "unit_by": unit_by(device, form),
         "decimals_by": decimals_by(device, form),
+        "since": form.since.map(since),
         "min": range.map(|(min, _)| number(min)),
         "max": range.map(|(_, max)| number(max)),
         "values": named(form),

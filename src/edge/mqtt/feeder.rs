@@ -9,7 +9,7 @@ use super::lock;
 use super::mailbox::Mailbox;
 use super::poller::Seen;
 use crate::edge::clock::Clock;
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::command::{OutcomeKind, Wish};
 use crate::engine::health::BrokerReport;
 use crate::engine::settings::Manner;
 use crate::engine::time::Duration;
@@ -159,7 +159,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             Some(Incoming::Set { .. }) if !retained && stale.is_some() => {
                 let reason = stale.unwrap_or_default();
                 tracing::warn!("`{topic}` is not obeyed: {reason}");
-                let outcome = Outcome::new(OutcomeKind::Expired, &payload, &reason);
+                let outcome = Wish::parse(&payload).ended(OutcomeKind::Expired, &reason);
                 let topic = topics::outcome_of(topic);
                 self.mailbox.outbox().push(Message::once(topic, outcome.to_json()));
             }

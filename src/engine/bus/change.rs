@@ -1,6 +1,6 @@
 //! Devices leave a running bus and come to it, while the others go on as if nothing had happened.
 
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::command::OutcomeKind;
 use crate::engine::memory::Memories;
 use crate::engine::plan::Tariff;
 use crate::engine::settings::DeviceSettings;
@@ -28,7 +28,7 @@ impl Bus {
             self.waiting.take_all().into_iter().partition(|waiting| waiting.device == index);
         self.waiting.put_all(others);
         for waiting in of_it {
-            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, CHANGED);
+            let outcome = waiting.wanted.ended(OutcomeKind::Refused, CHANGED);
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
         self.end_settling_of(Some(index), CHANGED);

@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use crate::engine::address::Span;
-use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step};
+use crate::engine::command::{self, CommandFlow, Outcome, OutcomeKind, Step, Wish};
 use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::time::{Duration, Time};
@@ -20,7 +20,7 @@ use super::{Bus, Command, LinkState, Purpose, Severity};
 pub(super) struct Active {
     pub(super) device: usize,
     target: Target,
-    wanted: String,
+    wanted: Wish,
     /// When it came, until its first request is on its way; not of a setting, which nobody gave.
     pub(super) came_at: Option<Time>,
     flow: CommandFlow,
@@ -72,21 +72,19 @@ impl Bus {
             return;
         }
         let is_press = self.devices[device].is_press(target);
+        let wish = Wish::parse(&command.payload);
         if is_press {
             if let Some(reason) = self.devices[device].is_too_soon(self.now, target) {
-                self.tell_outcome(
-                    device,
-                    target,
-                    Outcome::new(OutcomeKind::Refused, &command.payload, reason),
-                );
+                self.tell_outcome(device, target, wish.ended(OutcomeKind::Refused, reason));
                 return;
             }
         }
-        let waiting = Waiting::new(self.now, device, target, command.payload, is_press);
+        let waiting = Waiting::new(self.now, device, target, wish, is_press);
         for (replaced, reason) in self.waiting.push(waiting) {
-            let outcome = Outcome::new(OutcomeKind::Expired, &replaced.wanted, reason);
+            let outcome = replaced.wanted.ended(OutcomeKind::Expired, reason);
             self.tell_outcome(replaced.device, replaced.target, outcome);
         }
+        self.tell_what_waits(device);
     }
 
     /// There is no such point, or its device is just being exchanged for what a new configuration says of it.
@@ -101,7 +99,7 @@ impl Bus {
             None => CHANGED.to_string(),
         };
         let topic = self.context.topics_of(device).outcome(point);
-        let outcome = Outcome::new(OutcomeKind::Refused, payload, reason);
+        let outcome = Wish::parse(payload).ended(OutcomeKind::Refused, reason);
         self.context.publish(Message::once(topic, outcome.to_json()));
     }
 
@@ -116,14 +114,15 @@ impl Bus {
                 continue;
             }
             let reason = device.why_not(waiting.target);
-            let outcome = Outcome::new(OutcomeKind::Expired, &waiting.wanted, reason);
+            let outcome = waiting.wanted.ended(OutcomeKind::Expired, reason);
             self.tell_outcome(waiting.device, waiting.target, outcome);
+            self.tell_what_waits(waiting.device);
         }
     }
 
     pub(super) fn refuse_what_waits(&mut self) {
         for waiting in self.waiting.take_all() {
-            let outcome = Outcome::new(OutcomeKind::Refused, &waiting.wanted, STOPPING);
+            let outcome = waiting.wanted.ended(OutcomeKind::Refused, STOPPING);
             self.tell_outcome(waiting.device, waiting.target, outcome);
         }
         self.refuse_requests();
@@ -133,6 +132,20 @@ impl Bus {
                 device.say_offline(&mut self.context);
             }
         }
+    }
+
+    /// Tells which values of this device wait until their EEPROM may be written again.
+    fn tell_what_waits(&mut self, device: usize) {
+        let state = &self.devices[device];
+        let of_device = self.waiting.iter().filter(|waiting| waiting.device == device);
+        let points = of_device.filter_map(|waiting| match waiting.target {
+            Target::Point(point) if state.details(point).persistent => {
+                state.spares_eeprom(self.now, waiting.target, &waiting.wanted.text).then_some(point)
+            }
+            _ => None,
+        });
+        let points = points.collect();
+        self.devices[device].wait_for_eeprom(self.now, points, &mut self.context);
     }
 
     /// Nothing can be read back any more.
@@ -149,7 +162,7 @@ impl Bus {
         for Settling { active, next, .. } in ended {
             let is_unwritten = next.is_some_and(|call| call.is_write());
             let what = if is_unwritten { "not written" } else { "written, but not read back" };
-            let outcome = Outcome::new(OutcomeKind::NoReply, &active.wanted, format!("{what}: {reason}"));
+            let outcome = active.wanted.ended(OutcomeKind::NoReply, format!("{what}: {reason}"));
             self.end_command(active, outcome);
         }
     }
@@ -176,12 +189,13 @@ impl Bus {
         let can_begin = |waiting: &Waiting| can_begin(devices, settling, now, waiting);
         let Some(waiting) = self.waiting.take_first(can_begin) else { return false };
         let Waiting { device, target, wanted, came_at, .. } = waiting;
+        self.tell_what_waits(device);
         let orders = match target {
-            Target::Point(point) | Target::Setting(point) => VecDeque::from([(point, wanted.clone())]),
-            Target::Thing(thing) => match self.devices[device].orders(thing, &wanted) {
+            Target::Point(point) | Target::Setting(point) => VecDeque::from([(point, wanted.text.clone())]),
+            Target::Thing(thing) => match self.devices[device].orders(thing, &wanted.text) {
                 Ok(orders) => orders.into(),
                 Err(reason) => {
-                    self.tell_outcome(device, target, Outcome::new(OutcomeKind::Refused, &wanted, reason));
+                    self.tell_outcome(device, target, wanted.ended(OutcomeKind::Refused, reason));
                     return true;
                 }
             },
@@ -212,7 +226,7 @@ impl Bus {
         };
         let Some((device, (point, wanted))) = self.askable().find_map(next) else { return false };
         let orders = VecDeque::from([(point, wanted.clone())]);
-        self.begin_order(device, Target::Setting(point), wanted, None, orders);
+        self.begin_order(device, Target::Setting(point), wanted.into(), None, orders);
         true
     }
 
@@ -221,7 +235,7 @@ impl Bus {
         &mut self,
         device: usize,
         target: Target,
-        wanted: String,
+        wanted: Wish,
         came_at: Option<Time>,
         mut orders: VecDeque<(PointIndex, String)>,
     ) {
@@ -234,7 +248,7 @@ impl Bus {
             (None, Step::Finished(outcome)) => {
                 self.setting_ended(device, target, &outcome);
                 self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
-                self.tell_outcome(device, target, of_target(target, wanted, outcome));
+                self.tell_outcome(device, target, wanted.of(outcome));
             }
             (None, Step::Ask(_) | Step::AskLater(..) | Step::Settle(_)) => {}
         }
@@ -349,7 +363,8 @@ impl Bus {
         let Active { device, target, wanted, flow, .. } = active;
         self.setting_ended(device, target, &outcome);
         self.devices[device].command_ended(self.now, flow.point(), &outcome, &mut self.context);
-        self.tell_outcome(device, target, of_target(target, wanted, outcome));
+        // Of a thing it names what was wanted of the thing, and holds what its last point answered.
+        self.tell_outcome(device, target, wanted.of(outcome));
     }
 
     fn setting_ended(&mut self, device: usize, target: Target, outcome: &Outcome) {
@@ -381,14 +396,6 @@ fn can_begin(devices: &[DeviceState], settling: &[Settling], now: Time, waiting:
         let same = |active: &Active| active.device == waiting.device && active.flow.point() == *point;
         settling.iter().any(|settling| same(&settling.active))
     };
-    device.can_take(now, waiting.target, &waiting.wanted)
+    device.can_take(now, waiting.target, &waiting.wanted.text)
         && !device.written_by(waiting.target).iter().any(is_settling)
-}
-
-/// A thing's outcome names what was wanted of the thing, and holds what its last point answered.
-fn of_target(target: Target, wanted: String, outcome: Outcome) -> Outcome {
-    match target {
-        Target::Point(_) | Target::Setting(_) => outcome,
-        Target::Thing(_) => Outcome { wanted, ..outcome },
-    }
 }

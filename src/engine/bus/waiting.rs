@@ -1,5 +1,6 @@
 //! Commands that wait for their turn: bounded, the newest value of a point wins, none waits for ever.
 
+use crate::engine::command::Wish;
 use crate::engine::device::PointIndex;
 use crate::engine::time::{Duration, Time};
 
@@ -21,7 +22,7 @@ pub enum Target {
 pub struct Waiting {
     pub device: usize,
     pub target: Target,
-    pub wanted: String,
+    pub wanted: Wish,
     pub deadline: Time,
     /// Since when it could begin, for all that the bus does not decide.
     pub came_at: Time,
@@ -35,7 +36,7 @@ impl Waiting {
     const PRESS_TIME_TO_LIVE: Duration = Duration::from_secs(3);
 
     /// A command that may begin at `from`.
-    pub fn new(from: Time, device: usize, target: Target, wanted: String, is_press: bool) -> Waiting {
+    pub fn new(from: Time, device: usize, target: Target, wanted: Wish, is_press: bool) -> Waiting {
         let mut waiting = Waiting { device, target, wanted, deadline: from, came_at: from, is_press };
         waiting.put_off(from);
         waiting

@@ -10,7 +10,7 @@ use crate::engine::address::Span;
 use crate::engine::configuration::words::{
     BaudRate, BrokerUrl, HostPort, Listen, Name, Part, Qos, StopBits, Token, Topic, Unit,
 };
-use crate::engine::device::Poll;
+use crate::engine::device::{OutOfRange, Poll};
 use crate::engine::profile::file::{Intervals, Point, Presentation, Thing, Wire};
 use crate::engine::settings::{self, Layout, OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
@@ -302,6 +302,8 @@ record! {
         deadband: Option<At<Decimal>>,
         /// When it is read.
         poll: Option<At<Poll>>,
+        /// What becomes of a command with a number beyond the range.
+        out_of_range: Option<At<OutOfRange>>,
     } and presentation: Presentation
 }
 

@@ -2,7 +2,7 @@
 
 use crate::engine::configuration::file::PointWish;
 use crate::engine::device::{
-    self, Condition, Device, Encoding, Form, Kind, Names, Point, PointIndex, Poll, Thing, Unit,
+    self, Condition, Device, Encoding, Form, Kind, Point, PointIndex, Poll, Thing, Unit,
 };
 use crate::engine::profile::file;
 use crate::engine::units::{self, Release};
@@ -72,7 +72,7 @@ fn apply_one(
         hint_at_unit(&point.name, unit, &unit.place, warnings);
     }
     if let Some(deadband) = &wish.deadband {
-        if !forms(point).any(is_number) {
+        if !forms(point).any(|form| form.is_number() || form.since.is_some()) {
             faults.add(
                 &deadband.place,
                 format!("`{}` is no number; only a number has a `deadband`", point.name),
@@ -85,6 +85,16 @@ fn apply_one(
             );
         }
         point.deadband = Some(deadband.value);
+    }
+    let takes_numbers = point.takes_numbers();
+    if let Some(out_of_range) = &wish.out_of_range {
+        match &mut point.write {
+            Some(write) if takes_numbers => write.out_of_range = out_of_range.value,
+            _ => faults.add(
+                &out_of_range.place,
+                format!("no number is written to `{}`; remove `out_of_range`", point.name),
+            ),
+        }
     }
     let look = &wish.presentation;
     if let Some(icon) = &look.icon {
@@ -105,6 +115,7 @@ fn apply_to_thing(thing: &mut Thing, wish: &PointWish, faults: &mut Faults) {
         wish.range.as_ref().map(|key| ("range", &key.place)),
         wish.deadband.as_ref().map(|key| ("deadband", &key.place)),
         wish.poll.as_ref().map(|key| ("poll", &key.place)),
+        wish.out_of_range.as_ref().map(|key| ("out_of_range", &key.place)),
         look.r#as.as_ref().map(|key| ("as", &key.place)),
         look.state_class.as_ref().map(|key| ("state_class", &key.place)),
         wish.when.iter().next().map(|(key, _)| ("when", &key.place)),
@@ -218,7 +229,7 @@ fn give_unit(point: &mut Point, unit: &At<String>, faults: &mut Faults) {
     let name = &point.name;
     let refusal = match &mut point.encoding {
         Encoding::Cases { .. } => format!("the unit of `{name}` follows its case; remove `unit`"),
-        Encoding::Plain(form) if !is_number(form) => {
+        Encoding::Plain(form) if !form.is_number() => {
             format!("`{name}` is no number and has no unit; remove `unit`")
         }
         Encoding::Plain(form) => match &form.unit {
@@ -267,12 +278,14 @@ fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults, warn
         };
         let (class, state) =
             (point.presentation.device_class.as_deref(), point.presentation.state_class.as_deref());
-        if let (Some(place), Err(message)) = (place, units::check(platform, class, unit, state)) {
+        let fits = units::check(platform, class, unit, state);
+        let fits = fits.and_then(|()| units::check_sense(platform, form, class, state));
+        if let (Some(place), Err(message)) = (place, fits) {
             faults.add(place, message);
             return;
         }
         let needed =
-            || units::needed_by(class?).filter(|_| matches!(form.unit, Unit::None) && is_number(form));
+            || units::needed_by(class?).filter(|_| matches!(form.unit, Unit::None) && form.is_number());
         if let (Some(wished), Some(needed)) = (&look.device_class, needed()) {
             let message = format!(
                 "device class `{}` without a unit: Home Assistant makes nothing of such a number; expected `unit` \
@@ -329,8 +342,4 @@ pub fn forms(point: &Point) -> impl Iterator<Item = &Form> {
         Encoding::Cases { cases, .. } => (None, cases.as_slice()),
     };
     plain.into_iter().chain(cases.iter().filter_map(|case| case.form.as_ref()))
-}
-
-fn is_number(form: &Form) -> bool {
-    form.kind != Kind::Bool && !form.kind.is_text() && !matches!(form.names, Names::All(_))
 }

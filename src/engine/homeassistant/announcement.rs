@@ -205,7 +205,9 @@ pub fn announcement(
             entity(&device.device, index, known).into_iter().chain(companions(&device.device, index, known));
         for entity in entities {
             let mut component = component(&identity, own, device, &point.name, &entity);
-            if !gateway.retains && entity.device_class.as_deref() == Some("enum") {
+            let is_no_number =
+                matches!(entity.device_class.as_deref(), Some("enum" | "timestamp" | "uptime"));
+            if !gateway.retains && is_no_number {
                 component.insert("value_template".into(), NOTHING_IS_NONE.into());
             }
             components.push((entity.key.clone(), component));
@@ -237,7 +239,7 @@ pub fn announcement(
 /// How the device is on its wire.
 fn diagnostics(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> Components {
     let (topic, entity, key, object) = (own.health(), &device.name, "wire_", "value_json");
-    let place = Place { identity, entity, key, topic: &topic, object };
+    let place = Place { identity, entity, key, topic: &topic, object, may_lack: false };
     let mut components = place.times(&["turnaround_p95"]);
     for (class, name) in [(Poll::Fast, "Period of fast polls"), (Poll::Slow, "Period of slow polls")] {
         if device.device.points.iter().any(|point| point.poll == class) {
@@ -249,8 +251,8 @@ fn diagnostics(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> C
 }
 
 /// What the broker keeps of an earlier run is taken back with an empty message, if nothing is to be kept. Home
-/// Assistant passes over it for most, and warns of it where there are names: of enumerations, of a climate's
-/// modes.
+/// Assistant passes over it for most, and warns of it where there are names or moments: of enumerations, of a climate's
+/// modes, of timestamps.
 const NOTHING_IS_NONE: &str = "{{ value or none }}";
 
 /// The key of the entity that counts the writes to the device's EEPROM, and the info's too.
@@ -267,6 +269,9 @@ fn eeprom_writes(identity: &str, own: &DeviceTopics, device: &DeviceSettings) ->
         "state_class": "total_increasing",
         "entity_category": "diagnostic",
         "icon": "mdi:memory",
+        // What the guard holds back at the moment; the broker may keep an info from before there was one.
+        "json_attributes_topic": own.info(),
+        "json_attributes_template": "{{ value_json.eeprom | tojson if value_json.eeprom is defined else '{}' }}",
     });
     if let Value::Object(component) = component { component } else { Map::new() }
 }

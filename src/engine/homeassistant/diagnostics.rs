@@ -14,6 +14,8 @@ pub(super) struct Place<'p> {
     pub topic: &'p str,
     /// The expression of the object in it: `value_json`.
     pub object: &'p str,
+    /// The message may come without the object: what the broker keeps may be older than what it tells of.
+    pub may_lack: bool,
 }
 
 /// Entities of this device, in their order.
@@ -48,10 +50,19 @@ impl Place<'_> {
             "unique_id": format!("{}_{key}", self.identity),
             "default_entity_id": format!("{platform}.{}_{key}", self.entity),
             "state_topic": self.topic,
-            "value_template": format!("{{{{ {} }}}}", value.replace("OBJECT", self.object)),
+            "value_template": self.template(value, "none"),
         }));
         component.extend(object(more));
         (key, component)
+    }
+
+    /// What the expression says of the object, or `else`: Home Assistant logs an error for what is not there.
+    fn template(&self, value: &str, otherwise: &str) -> String {
+        let value = value.replace("OBJECT", self.object);
+        match self.may_lack {
+            true => format!("{{{{ ({value}) if {} is defined else {otherwise} }}}}", self.object),
+            false => format!("{{{{ {value} }}}}"),
+        }
     }
 
     fn of_wire(
@@ -91,7 +102,7 @@ impl Place<'_> {
             if name == "Exceptions" {
                 // Which they were: as attributes, since nobody knows beforehand which there will be.
                 component.insert("json_attributes_topic".into(), self.topic.into());
-                let codes = format!("{{{{ {}.exceptions_by_code | tojson }}}}", self.object);
+                let codes = self.template("OBJECT.exceptions_by_code | tojson", "'{}'");
                 component.insert("json_attributes_template".into(), codes.into());
             }
             (key, component)

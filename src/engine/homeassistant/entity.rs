@@ -6,7 +6,7 @@ use serde_json::{Map, Number, Value, json};
 use super::thing;
 use crate::engine::codec::{self, Limits, Resolved};
 use crate::engine::device::{
-    Category, Device, Encoding, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
+    Category, Device, Encoding, Form, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
 };
 use crate::engine::units;
 use crate::engine::value::{Decimal, Missing};
@@ -61,11 +61,7 @@ impl Entity {
 
     /// Whether the state is a number: then Home Assistant logs an error for anything else.
     fn is_number(&self, resolved: &Resolved) -> bool {
-        let form = resolved.form;
-        matches!(self.platform, Platform::Sensor | Platform::Number)
-            && form.kind != Kind::Bool
-            && !form.kind.is_text()
-            && !matches!(form.names, Names::All(_))
+        matches!(self.platform, Platform::Sensor | Platform::Number) && resolved.form.is_number()
     }
 
     /// The parts of a discovery component that come from the entity itself.
@@ -155,7 +151,8 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
             avoid_none(&mut entity);
         }
     } else {
-        entity.device_class = fitting_class(point, platform, None);
+        entity.device_class = fitting_class(point, platform, resolved.form, None)
+            .or_else(|| units::class_of_sense(resolved.form).map(str::to_string));
         entity.event_types = point.event.iter().cloned().collect();
         if platform == Platform::Text {
             entity.length = Some(match resolved.form.kind {
@@ -243,7 +240,7 @@ fn button_beside(device: &Device, point: &Point, main: &Entity, name: &str) -> E
 
 fn describe_number(entity: &mut Entity, point: &Point, resolved: &Resolved) {
     let unit = resolved.unit.as_deref().map(units::normalized);
-    entity.device_class = fitting_class(point, entity.platform, unit.as_deref())
+    entity.device_class = fitting_class(point, entity.platform, resolved.form, unit.as_deref())
         .or_else(|| units::class_of_unit(unit.as_deref()?, resolved.form.difference).map(str::to_string));
     let class = entity.device_class.as_deref();
     let mut conditions = Vec::new();
@@ -309,10 +306,13 @@ fn derived_state_class(
     units::state_class(class, unit, signed)
 }
 
-/// The device class that was wished for, where it goes with the platform and the present unit.
-fn fitting_class(point: &Point, platform: Platform, unit: Option<&str>) -> Option<String> {
+/// The device class that was wished for, where it goes with the platform, the form and the present unit.
+fn fitting_class(point: &Point, platform: Platform, form: &Form, unit: Option<&str>) -> Option<String> {
     let wished = point.presentation.device_class.clone();
-    wished.filter(|class| units::check(platform, Some(class), unit, None).is_ok())
+    wished.filter(|class| {
+        units::check(platform, Some(class), unit, None).is_ok()
+            && units::check_sense(platform, form, Some(class), None).is_ok()
+    })
 }
 
 fn category(point: &Point, platform: Platform) -> Option<Category> {
@@ -338,6 +338,7 @@ fn key(point: &Point, resolved: &Resolved) -> String {
         None if resolved.form.kind == Kind::Bool => "flag".into(),
         None if resolved.form.kind.is_text() => "text".into(),
         None if matches!(resolved.form.names, Names::All(_)) => "state".into(),
+        None if resolved.form.since.is_some() => "time".into(),
         None => return point.name.clone(),
     };
     format!("{}_{ending}", point.name)
@@ -384,6 +385,7 @@ mod tests {
     use crate::engine::address::{Address, Span, Table};
     use crate::engine::device::{Decimals, Form, Unit, Write};
     use crate::engine::test_device::device_of;
+    use crate::engine::time::Date;
 
     /// A point at `holding 0` (or `coil 0` for a flag), read slowly, as `change` makes it.
     fn point_with(form: Form, rule: Option<WriteRule>, change: impl FnOnce(&mut Point)) -> Point {
@@ -476,6 +478,22 @@ mod tests {
             &["sensor flow_value:"],
         );
         check_entity(point_with(Form::new(Kind::Bool), None, NOTHING), &["binary_sensor flow_value:"]);
+        let moment = Form { since: Some(Date(0)), ..Form::new(Kind::U32) };
+        check_entity(
+            point_with(moment.clone(), None, NOTHING),
+            &["sensor flow_value: device_class=timestamp"],
+        );
+        check_entity(
+            point_with(moment.clone(), None, |point| {
+                point.presentation.device_class = Some("uptime".into());
+                point.presentation.state_class = Some("measurement".into());
+            }),
+            &["sensor flow_value: device_class=uptime"],
+        );
+        check_entity(
+            point_with(moment, None, |point| point.presentation.device_class = Some("duration".into())),
+            &["sensor flow_value: device_class=timestamp"],
+        );
         let names = Names::All(named(&[(0, "mains"), (1, "battery")]));
         check_entity(
             point_with(Form { names, ..Form::new(Kind::U16) }, None, NOTHING),

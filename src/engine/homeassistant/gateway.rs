@@ -49,7 +49,15 @@ pub fn announce_bus(gateway: &Gateway, bus: &str) -> Announcement {
     let topic = topics.bridge_health();
     // In brackets: a bus may be called `items`, which is also a method of a mapping.
     let object = format!("value_json.buses['{bus}']");
-    let place = Place { identity: &identity, entity: &identity, key: "", topic: &topic, object: &object };
+    let place = Place {
+        identity: &identity,
+        entity: &identity,
+        key: "",
+        topic: &topic,
+        object: &object,
+        // A bus is announced before it is told of, and the health of before may be all that the broker has.
+        may_lack: true,
+    };
     let link = json!({"device_class": "connectivity"});
     let load =
         json!({"unit_of_measurement": "%", "state_class": "measurement", "suggested_display_precision": 1});

@@ -3,9 +3,9 @@
 use serde_json::{Value as Json, json};
 
 use crate::engine::address::{Address, Span};
-use crate::engine::device::{Category, Kind, Order, Platform, Poll, ThingKind, WriteFunction};
+use crate::engine::device::{Category, Kind, Order, OutOfRange, Platform, Poll, ThingKind, WriteFunction};
 use crate::engine::profile::text::{Digits, Name, PointPath, Quirk, Range, Repeat, Step, Writable};
-use crate::engine::time::Duration;
+use crate::engine::time::{Date, Duration};
 use crate::engine::value::Decimal;
 use crate::engine::yaml::{At, Content, Definitions, Faults, Map, Node, Read};
 use crate::record;
@@ -145,6 +145,8 @@ record! {
         poll: Option<At<Poll>>,
         /// What may be written: `any`, `0..3`, `4..20 step 0.5`, or some of the named values.
         write: Option<At<Writable>>,
+        /// What becomes of a command with a number beyond the range; `refuse` where it is left out.
+        out_of_range: Option<At<OutOfRange>>,
         /// Where it is written, if not where it is read.
         write_at: Option<At<Address>>,
         /// As `step`, for `write_at`.
@@ -203,6 +205,9 @@ record! {
         offset: Option<At<Decimal>>,
         /// Digits behind the dot of what the register holds, or the point that says how many.
         decimals: Option<At<Digits>>,
+        /// The register counts seconds since this day began (UTC), `1970-01-01` or `2000-01-01`, and stands for a
+        /// moment.
+        since: Option<At<Date>>,
         /// The unit, as Home Assistant spells it. Beside a shared `is`: instead of each `unit_by` there.
         unit: Option<At<String>>,
         /// The point whose named value is the unit.

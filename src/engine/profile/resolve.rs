@@ -146,6 +146,7 @@ impl Resolution<'_, '_> {
                 self.lookup(&path, expanded).map(Decimals::By)
             }
         };
+        resolved.since = form.since.as_ref().map(|since| since.value);
         // The point's own unit stands where a shared case leaves it to a point that this device has not.
         resolved.unit = match (&form.unit, &form.unit_by, &expanded.file.form.unit) {
             (Some(unit), _, _) | (None, Some(_), Some(unit)) => Unit::Fixed(unit.value.clone()),
@@ -338,6 +339,7 @@ impl Resolution<'_, '_> {
             rule,
             settle: file.settle.as_ref().map(|settle| settle.value).unwrap_or_default(),
             on_change,
+            out_of_range: file.out_of_range.as_ref().map(|clamps| clamps.value).unwrap_or_default(),
         })
     }
 

@@ -4,7 +4,8 @@ use serde_json::{Value as Json, json};
 
 use crate::choices;
 use crate::engine::address::{Address, Bits, Span, Table};
-use crate::engine::device::{Category, Kind, Order, Platform, Poll, ThingKind, WriteFunction};
+use crate::engine::device::{Category, Kind, Order, OutOfRange, Platform, Poll, ThingKind, WriteFunction};
+use crate::engine::time::Date;
 use crate::engine::value::Decimal;
 use crate::engine::yaml::{At, Content, Definitions, Faults, Node, Read, Scalar};
 
@@ -21,6 +22,10 @@ choices! { "a function code that writes", WriteFunction {
     "6" => WriteFunction::SingleRegister,
     "15" => WriteFunction::MultipleCoils,
     "16" => WriteFunction::MultipleRegisters,
+} }
+
+choices! { "what becomes of a value out of range", OutOfRange {
+    "refuse" => OutOfRange::Refuse, "clamp" => OutOfRange::Clamp,
 } }
 
 choices! { "a platform of a single point", Platform {
@@ -230,6 +235,29 @@ impl Scalar for Step {
     }
 }
 
+/// A day, as of `since`.
+impl Scalar for Date {
+    const EXPECTED: &'static str = "a day like `1970-01-01`";
+
+    fn parse(text: &str) -> Result<Date, String> {
+        let parts: Vec<Option<u64>> = text
+            .split('-')
+            .map(|part| part.parse().ok().filter(|_| part.bytes().all(|byte| byte.is_ascii_digit())))
+            .collect();
+        let day = match parts[..] {
+            [Some(year), Some(month), Some(day)] => Date::of_day(year, month, day),
+            _ => None,
+        };
+        day.ok_or_else(|| {
+            format!("`{text}` is no day since 1970; expected one like `1970-01-01` or `2000-01-01`")
+        })
+    }
+
+    fn schema() -> Json {
+        json!({"type": "string", "pattern": "^[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}$"})
+    }
+}
+
 /// `-50..150`, both ends included.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Range {
@@ -434,6 +462,12 @@ mod tests {
         check::<Range>("10..1", "the range `10..1` is empty; expected the lower end first, as in `0..100`");
         check::<Kind>("text 8", "Text { registers: 8 }");
         check::<Digits>("decimals", "By(PointPath(\"decimals\"))");
+        check::<Date>("2000-01-01", "Date(946684800)");
+        check::<Date>(
+            "2000-02-30",
+            "`2000-02-30` is no day since 1970; expected one like `1970-01-01` or `2000-01-01`",
+        );
+        check::<Date>("unix", "`unix` is no day since 1970; expected one like `1970-01-01` or `2000-01-01`");
         check::<Digits>("12", "12 is out of range; expected 0 to 9 decimals");
     }
 }

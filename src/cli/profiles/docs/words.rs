@@ -8,7 +8,7 @@ use crate::engine::device::{
 };
 use crate::engine::homeassistant::{Entity, entity};
 use crate::engine::time::Duration;
-use crate::engine::value::{Decimal, Missing, Reading};
+use crate::engine::value::{Decimal, Reading};
 
 /// Lists of more names than this get a table of their own.
 pub const NAMES_IN_CELL: usize = 4;
@@ -154,6 +154,7 @@ pub fn range(device: &Device, index: PointIndex, form: &Form, table: Option<&str
         (Kind::Bool, _) => parts.push("`ON`, `OFF`".to_string()),
         (_, Names::All(_)) => parts.push(listed),
         (kind, _) if kind.is_text() => parts.push(text(kind)),
+        _ if form.since.is_some() => parts.push(MOMENT.into()),
         (_, names) => {
             parts.extend(numbers(device, index, form, rule));
             if parts.is_empty() && form.kind.is_float() && rule.is_some() {
@@ -171,6 +172,8 @@ pub fn range(device: &Device, index: PointIndex, form: &Form, table: Option<&str
     }
     parts.join("; ")
 }
+
+const MOMENT: &str = "a date and time, as `2026-11-27T05:24:00+00:00`";
 
 fn text(kind: Kind) -> String {
     match kind {
@@ -232,9 +235,7 @@ pub fn default(device: &Device, index: PointIndex) -> String {
     let Some(raw) = device.points[index].default else { return String::new() };
     let shown = codec::resolve(device, index, &usual_registers(device, index)).ok();
     match shown.map(|resolved| codec::read(&resolved, &words(&resolved, raw))) {
-        Some(Reading::Missing(Missing::UnknownValue(_) | Missing::NotText | Missing::NotANumber)) | None => {
-            format!("register {raw}")
-        }
+        Some(Reading::Missing(_)) | None => format!("register {raw}"),
         Some(reading @ (Reading::Name(_) | Reading::Text(_) | Reading::Flag(_))) => format!("`{reading}`"),
         Some(Reading::Number(number)) => number.normalized().to_string(),
         Some(reading) => reading.to_string(),
@@ -290,6 +291,7 @@ pub fn case(device: &Device, case: &Case) -> (String, String) {
     let mut range = match (form.kind, &form.names) {
         (Kind::Bool, _) => "`ON`, `OFF`".into(),
         (kind, _) if kind.is_text() => text(kind),
+        _ if form.since.is_some() => MOMENT.into(),
         (_, Names::All(names)) => codes(names.iter().map(|(_, name)| name.as_str())),
         (_, names) => {
             let names = codes(names.list().iter().map(|(_, name)| name.as_str()));

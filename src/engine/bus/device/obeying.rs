@@ -70,10 +70,15 @@ impl DeviceState {
     /// Whether a command can begin: the device is there, is the right one, what decides about the points
     /// is known, and their EEPROM has been spared long enough.
     pub(in crate::engine::bus) fn can_take(&self, now: Time, target: Target, wanted: &str) -> bool {
-        (now >= self.writable_at(target) || self.seems_to_hold(target, wanted))
+        !self.spares_eeprom(now, target, wanted)
             && self.presence == Presence::Present
             && self.patience.failures() == 0
             && self.unknown_selector(target).is_none()
+    }
+
+    /// Whether the command has to wait because what it writes has just been written.
+    pub(in crate::engine::bus) fn spares_eeprom(&self, now: Time, target: Target, wanted: &str) -> bool {
+        now < self.writable_at(target) && !self.seems_to_hold(target, wanted)
     }
 
     /// Whether the point's last reading is what is wanted: to find it so again wears out nothing.
@@ -85,8 +90,8 @@ impl DeviceState {
             return false;
         };
         let Some(write) = &details.write else { return false };
-        let words = codec::encode(details, &write.rule, &resolved, wanted);
-        words.is_ok_and(|words| codec::read(&resolved, &words) == *self.values.reading(point))
+        let obeyed = codec::obey(details, write, &resolved, wanted);
+        obeyed.is_ok_and(|obeyed| codec::read(&resolved, &obeyed.words) == *self.values.reading(point))
     }
 
     fn unknown_selector(&self, target: Target) -> Option<PointIndex> {

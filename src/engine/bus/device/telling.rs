@@ -182,6 +182,9 @@ impl DeviceState {
             "eeprom_writes": self.counters.persistent_writes,
             "drift": drift_json(&self.upkeep.drift()),
         });
+        if self.settings.device.points.iter().any(|point| point.persistent) {
+            info["eeprom"] = self.eeprom_json(now, context);
+        }
         self.told_present = self.presence == Presence::Present;
         let without_dates = info.to_string();
         if without_dates == self.told_info && !self.info_is_old(now, context) {
@@ -190,6 +193,35 @@ impl DeviceState {
         (self.told_info, self.told_info_at) = (without_dates, now);
         info["last_read"] = self.dates_of_readings(context);
         context.publish(Message::retained(context.topics_of(&self.settings.name).info(), info.to_string()));
+    }
+
+    /// What the guard of the EEPROM holds back: values that wait, each until when, and until when nothing at all
+    /// is written.
+    fn eeprom_json(&self, now: Time, context: &Context) -> serde_json::Value {
+        let date = |time: Time| match context.date_of(time) {
+            Some(date) => serde_json::Value::from(date.to_string()),
+            None => serde_json::Value::Null,
+        };
+        let waiting = self.wear.waiting.iter().map(|point| {
+            let name = self.settings.device.points[*point].name.clone();
+            (name, date(self.wear.allowed_at(*point)))
+        });
+        let waiting: serde_json::Map<String, serde_json::Value> = waiting.collect();
+        let is_spent = self.wear.spent(now).is_some();
+        json!({"waiting": waiting, "spent": is_spent, "spent_until": is_spent.then(|| date(self.wear.budget_at()))})
+    }
+
+    /// These points wait for their EEPROM's sake; who looks at the device shall see it.
+    pub(in crate::engine::bus) fn wait_for_eeprom(
+        &mut self,
+        now: Time,
+        points: Vec<PointIndex>,
+        context: &mut Context,
+    ) {
+        if self.wear.waiting != points {
+            self.wear.waiting = points;
+            self.tell_info(now, context);
+        }
     }
 
     /// When each point was last read, also those that say nothing now.

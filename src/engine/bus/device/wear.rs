@@ -21,12 +21,15 @@ pub(super) struct Wear {
     /// that tells when a day begins.
     left: u64,
     left_at: Time,
+    /// The points of which a value waits until they may be written again.
+    pub(super) waiting: Vec<PointIndex>,
 }
 
 impl Wear {
     /// A device that may be written as often as its `rules` say.
     pub(super) fn new(rules: Eeprom) -> Wear {
-        Wear { rules, written_at: BTreeMap::new(), left: Wear::full(rules), left_at: Time::default() }
+        let (written_at, waiting) = (BTreeMap::new(), Vec::new());
+        Wear { rules, written_at, left: Wear::full(rules), left_at: Time::default(), waiting }
     }
 
     fn full(rules: Eeprom) -> u64 {

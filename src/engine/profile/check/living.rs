@@ -49,9 +49,8 @@ impl Rules<'_, '_> {
     fn an_array_is_one_of_numbers_that_are_only_read(&mut self) {
         for Subject { file, point, .. } in self.entries() {
             let Some(count) = &file.count else { continue };
-            let is_number = |form: &&crate::engine::device::Form| {
-                form.kind != Kind::Bool && !form.kind.is_text() && form.names == Names::None
-            };
+            let is_number =
+                |form: &&crate::engine::device::Form| form.is_number() && form.names == Names::None;
             let message = if count.value < 2 {
                 "an array of fewer than two values; expected more, or no `count`"
             } else if point.at.bits.is_some() || !forms(point).iter().all(is_number) {

@@ -14,6 +14,7 @@ impl Rules<'_, '_> {
         self.types_fit_their_place();
         self.texts_have_no_scale_or_unit();
         self.flags_have_no_scale_or_unit();
+        self.moments_are_counted_in_whole_numbers();
         self.scales_and_units_are_said_once();
         self.only_shared_names_are_left_out();
         self.names_of_values_are_unique();
@@ -118,6 +119,38 @@ impl Rules<'_, '_> {
             for (key, place) in said(&file.form) {
                 if !["values", "type"].contains(&key) {
                     self.faults.add(place, format!("`{key}` of a flag, which is OFF or ON; remove it"));
+                }
+            }
+        }
+    }
+
+    fn moments_are_counted_in_whole_numbers(&mut self) {
+        for Subject { file, point, .. } in self.entries() {
+            let is_flag = file.bits.is_some() || point.plain().is_some_and(|form| form.kind == Kind::Bool);
+            for form in forms_of(file) {
+                let Some(since) = form.since.as_ref().filter(|_| !is_flag) else { continue };
+                match &form.r#type {
+                    None => self.faults.add(
+                        &since.place,
+                        "`since` without a `type`; expected the one that counts the seconds, as in `type: u32`",
+                    ),
+                    Some(kind) if kind.value.is_float() => self.faults.add(
+                        &kind.place,
+                        format!("`since` of the type `{}`; expected a whole number, as in `type: u32`", kind.value.name()),
+                    ),
+                    Some(_) => {}
+                }
+                let mut others = said(form);
+                others.retain(|(key, _)| !["type", "scale", "since"].contains(key));
+                if file.difference {
+                    others.push(("difference", &since.place));
+                }
+                others.extend(file.press.as_ref().map(|press| ("press", &press.place)));
+                for (key, place) in others {
+                    self.faults.add(
+                        place,
+                        format!("`{key}` beside `since`, by which the register stands for a moment; remove one of the two"),
+                    );
                 }
             }
         }
@@ -263,7 +296,7 @@ impl Rules<'_, '_> {
                 (None, _) => format!(
                     "`{name}` decides here and has cases itself; expected a point that needs no other"
                 ),
-                (Some(form), _) if form.kind.is_float() || form.kind.is_text() => {
+                (Some(form), _) if form.kind.is_float() || form.kind.is_text() || form.since.is_some() => {
                     format!("`{name}` decides here and is no whole number; expected a register of one")
                 }
                 (Some(form), Wanted::Number) if matches!(form.names, Names::All(_)) => {
@@ -325,6 +358,7 @@ fn said(form: &Form) -> Vec<(&'static str, &Place)> {
     said.extend(form.scale.as_ref().map(|key| ("scale", &key.place)));
     said.extend(form.offset.as_ref().map(|key| ("offset", &key.place)));
     said.extend(form.decimals.as_ref().map(|key| ("decimals", &key.place)));
+    said.extend(form.since.as_ref().map(|key| ("since", &key.place)));
     said.extend(form.unit.as_ref().map(|key| ("unit", &key.place)));
     said.extend(form.unit_by.as_ref().map(|key| ("unit_by", &key.place)));
     said.extend(form.values.as_ref().map(|key| ("values", &key.place)));

@@ -45,7 +45,9 @@ impl Rules<'_, '_> {
                         _ => None,
                     };
                     let class = class.or_else(|| units::class_of_unit(unit?, form.difference));
-                    faults.push(units::check(platform, class, unit, state_class).err()?);
+                    let fits = units::check(platform, class, unit, state_class);
+                    let fits = fits.and_then(|()| units::check_sense(platform, form, class, state_class));
+                    faults.push(fits.err()?);
                 }
                 faults.into_iter().next()
             };

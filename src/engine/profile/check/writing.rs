@@ -1,6 +1,6 @@
 //! Rules of writing: what may be written, where, and by which function.
 
-use crate::engine::device::{Decimals, Encoding, Form, Kind, Names, Point, WriteFunction, WriteRule};
+use crate::engine::device::{Decimals, Encoding, Form, Kind, Point, WriteFunction, WriteRule};
 use crate::engine::profile::check::{Rules, Subject, is_true, raw_range};
 use crate::engine::profile::text::Writable;
 use crate::engine::value::Decimal;
@@ -13,7 +13,19 @@ impl Rules<'_, '_> {
         self.what_is_written_can_be();
         self.the_function_fits_the_place();
         self.what_is_written_fits_the_value();
+        self.only_a_number_is_out_of_range();
         self.what_reading_clears_is_not_written();
+    }
+
+    fn only_a_number_is_out_of_range(&mut self) {
+        for Subject { file, point, .. } in self.entries() {
+            if let Some(key) = file.out_of_range.as_ref().filter(|_| !point.takes_numbers()) {
+                self.faults.add(
+                    &key.place,
+                    "`out_of_range` of a point that no number is written to; remove it, or add a range as in `write: 0..100`",
+                );
+            }
+        }
     }
 
     fn only_what_is_written_says_how(&mut self) {
@@ -110,6 +122,11 @@ impl Rules<'_, '_> {
     fn what_is_written_fits_the_value(&mut self) {
         for Subject { file, point, .. } in self.entries() {
             let (Some(write), Some(place)) = (&point.write, place_of_rule(file)) else { continue };
+            let is_moment = |form: &&Form| form.since.is_some();
+            if !point.is_button() && super::forms(point).iter().any(is_moment) {
+                self.faults.add(place, "a moment cannot be written; remove `write`");
+                continue;
+            }
             let form = match &point.encoding {
                 Encoding::Plain(form) => form,
                 Encoding::Cases { .. } => {
@@ -144,11 +161,7 @@ impl Rules<'_, '_> {
     }
 
     fn any_value_is_a_clear_one(&mut self, point: &Point, form: &Form, place: &Place) {
-        let is_number = form.kind != Kind::Bool
-            && !form.kind.is_text()
-            && !form.kind.is_float()
-            && !matches!(form.names, Names::All(_));
-        if !is_number || form.range.is_some() {
+        if !form.is_number() || form.kind.is_float() || form.range.is_some() {
             return;
         }
         if let Some((min, max)) = raw_range(point, form) {

@@ -1,0 +1,97 @@
+//! What a message on a `set` topic wishes: a value, and perhaps a transaction that comes back with the outcome.
+
+use serde_json::Value as Json;
+
+use super::{Outcome, OutcomeKind};
+
+/// More bytes than any wish has: the longest text fills 125 registers. What is longer is no value, and is not
+/// repeated in an outcome, which no broker would take.
+pub(super) const BYTES_MAX: usize = 1024;
+
+/// A wanted value.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Wish {
+    /// As it was said.
+    pub text: String,
+    /// What its sender knows the outcome again by.
+    pub transaction: Option<Json>,
+}
+
+impl Wish {
+    /// The payload is the value, unless it is an object of exactly `value` and `transaction`.
+    pub fn parse(payload: &str) -> Wish {
+        enclosed(payload).unwrap_or_else(|| Wish::from(payload.to_string()))
+    }
+
+    /// It has ended without anything being written.
+    pub fn ended(&self, kind: OutcomeKind, reason: impl Into<String>) -> Outcome {
+        let transaction = self.transaction.clone();
+        Outcome { transaction, ..Outcome::new(kind, &self.text, reason) }
+    }
+
+    /// The outcome of what this wish came to.
+    pub fn of(&self, outcome: Outcome) -> Outcome {
+        Outcome { wanted: self.text.clone(), transaction: self.transaction.clone(), ..outcome }
+    }
+}
+
+fn enclosed(payload: &str) -> Option<Wish> {
+    // Nearly no value begins so, and a slider sends a thousand.
+    if payload.len() > BYTES_MAX || !payload.trim_start().starts_with('{') {
+        return None;
+    }
+    let Json::Object(mut object) = serde_json::from_str(payload).ok()? else { return None };
+    let (value, transaction) = (object.remove("value")?, object.remove("transaction")?);
+    let text = match value {
+        Json::String(text) => text,
+        Json::Number(number) => number.to_string(),
+        Json::Bool(on) => if on { "ON" } else { "OFF" }.to_string(),
+        Json::Null | Json::Array(_) | Json::Object(_) => return None,
+    };
+    object.is_empty().then_some(Wish { text, transaction: Some(transaction) })
+}
+
+impl From<String> for Wish {
+    /// Of what the gateway wishes itself, which waits for no outcome.
+    fn from(text: String) -> Wish {
+        Wish { text, transaction: None }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_an_object_of_a_value_and_a_transaction_is_taken_apart() {
+        for (payload, text, transaction) in [
+            ("21.5", "21.5", None),
+            ("", "", None),
+            (r#"{"value": 21.5, "transaction": "x"}"#, "21.5", Some(r#""x""#)),
+            (r#"{"value": 1e-5, "transaction": 7}"#, "0.00001", Some("7")),
+            (r#"{"value": 18446744073709551615, "transaction": 7}"#, "18446744073709551615", Some("7")),
+            (r#" {"transaction": {"a": [1]}, "value": "ON"}"#, "ON", Some(r#"{"a":[1]}"#)),
+            (r#"{"value": true, "transaction": null}"#, "ON", Some("null")),
+            (r#"{"value": false, "transaction": ""}"#, "OFF", Some(r#""""#)),
+            // To write such a text to a text point, it is put into another one.
+            (
+                r#"{"value": "{\"value\": 1, \"transaction\": 2}", "transaction": 3}"#,
+                r#"{"value": 1, "transaction": 2}"#,
+                Some("3"),
+            ),
+            (r#"{"value": 21.5}"#, r#"{"value": 21.5}"#, None),
+            (r#"{"value": [1], "transaction": 1}"#, r#"{"value": [1], "transaction": 1}"#, None),
+            (
+                r#"{"value": 1, "transaction": 1, "more": 1}"#,
+                r#"{"value": 1, "transaction": 1, "more": 1}"#,
+                None,
+            ),
+            (r#"{"value": 1, "transaction""#, r#"{"value": 1, "transaction""#, None),
+            (r#"{}"#, "{}", None),
+        ] {
+            let wish = Wish::parse(payload);
+            let found = wish.transaction.map(|transaction| transaction.to_string());
+            assert_eq!((wish.text.as_str(), found.as_deref()), (text, transaction), "{payload}");
+        }
+    }
+}
