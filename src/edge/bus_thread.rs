@@ -112,7 +112,7 @@ impl Threads {
         let (ended, end) = sync_channel(1);
         let stop = Arc::new(AtomicBool::new(false));
         let shares = matches!(settings.buses[index].link, Link::Tcp { .. });
-        let shared = if shares { Some(self.shared()?) } else { None };
+        let shared = if shares { Some(self.shared(clock)?) } else { None };
         let bell = match &shared {
             Some(shared) => shared.bell.clone(),
             None => Bell::new()?,
@@ -142,7 +142,7 @@ impl Threads {
     }
 
     /// The thread for connections, which begins with the first of them.
-    fn shared(&self) -> std::io::Result<Arc<Shared>> {
+    fn shared(&self, clock: Clock) -> std::io::Result<Arc<Shared>> {
         let mut shared = lock(&self.shared);
         if let Some(shared) = &*shared {
             return Ok(shared.clone());
@@ -154,10 +154,10 @@ impl Threads {
         });
         let epoll = epoll::create(epoll::CreateFlags::CLOEXEC)?;
         epoll::add(&epoll, &new.bell, epoll::EventData::new_u64(BELL), epoll::EventFlags::IN)?;
-        let of_thread = new.clone();
-        let run =
-            move || SharedThread { shared: of_thread, epoll, runners: Vec::new(), next_number: 0 }.run();
-        std::thread::Builder::new().name("connections".into()).spawn(run)?;
+        let (shared_with, runners) = (new.clone(), Vec::new());
+        let thread =
+            SharedThread { shared: shared_with, epoll, clock, runners, next_number: 0, wake_at: None };
+        std::thread::Builder::new().name("connections".into()).spawn(move || thread.run())?;
         *shared = Some(new.clone());
         Ok(new)
     }
@@ -255,14 +255,19 @@ const HEARD_MAX: usize = 64;
 struct SharedThread {
     shared: Arc<Shared>,
     epoll: OwnedFd,
+    clock: Clock,
+    /// By their numbers.
     runners: Vec<Numbered>,
     next_number: u64,
+    /// None of them wants to be woken before.
+    wake_at: Option<Time>,
 }
 
 struct Numbered {
     number: u64,
     runner: BusRunner,
     wake_at: Option<Time>,
+    is_heard: bool,
 }
 
 impl SharedThread {
@@ -276,17 +281,20 @@ impl SharedThread {
                 self.shared.bell.silence();
                 self.welcome();
             }
-            let woken_at = self.runners.first().map(|numbered| numbered.runner.clock().now());
-            for numbered in &mut self.runners {
-                let is_heard = heard.iter().any(|event| event.data.u64() == numbered.number);
-                let is_due = numbered.wake_at.is_some_and(|at| woken_at >= Some(at));
-                if rung || is_heard || is_due {
-                    numbered.runner.woken(rung, is_heard);
-                    numbered.settle(&self.epoll);
+            // Only those that have something to do are looked at: most of the time replies come, and there is
+            // nothing else.
+            for event in heard.drain(..) {
+                let number = event.data.u64();
+                if let Ok(at) = self.runners.binary_search_by_key(&number, |numbered| numbered.number) {
+                    self.runners[at].is_heard = true;
+                    if !rung {
+                        self.go_on(at, false);
+                    }
                 }
             }
-            heard.clear();
-            self.let_go();
+            if rung || self.wake_at.is_some_and(|at| self.clock.now() >= at) {
+                self.look_at_all(rung);
+            }
             if self.runners.is_empty() && self.shared.closing.load(Ordering::SeqCst) {
                 return;
             }
@@ -295,28 +303,43 @@ impl SharedThread {
 
     /// Waits for whatever comes first.
     fn wait(&self, heard: &mut Vec<epoll::Event>) {
-        let next =
-            self.runners.iter().filter_map(|numbered| Some((numbered.wake_at?, numbered.runner.clock())));
-        let next = next.min_by_key(|(at, _)| *at);
-        let timeout = next.map(|(at, clock)| timespec(clock.until(at)));
+        let timeout = self.wake_at.map(|at| timespec(self.clock.until(at)));
         // An interruption is as good as a time that has come; nothing else can fail here.
         let _ = epoll::wait(&self.epoll, spare_capacity(heard), timeout.as_ref());
+    }
+
+    /// Wakes everybody if the bell has `rung`, and those whose time has come.
+    fn look_at_all(&mut self, rung: bool) {
+        let now = self.clock.now();
+        for at in 0..self.runners.len() {
+            if rung || self.runners[at].wake_at.is_some_and(|at| now >= at) {
+                self.go_on(at, rung);
+            }
+        }
+        while let Some(at) = self.runners.iter().position(|numbered| numbered.runner.is_finished()) {
+            self.runners.remove(at).runner.finish();
+        }
+        self.wake_at = self.runners.iter().filter_map(|numbered| numbered.wake_at).min();
+    }
+
+    /// Lets one do what there is to do.
+    fn go_on(&mut self, at: usize, rung: bool) {
+        let numbered = &mut self.runners[at];
+        numbered.runner.woken(rung, std::mem::take(&mut numbered.is_heard));
+        numbered.settle(&self.epoll);
+        // One that has ended is let go of at once.
+        let wake_at = if numbered.runner.is_finished() { Some(Time(0)) } else { numbered.wake_at };
+        self.wake_at = self.wake_at.into_iter().chain(wake_at).min();
     }
 
     /// Takes the buses that have come.
     fn welcome(&mut self) {
         for mut runner in lock(&self.shared.arrivals).drain(..) {
             runner.begin();
-            let mut numbered = Numbered { number: self.next_number, runner, wake_at: None };
+            let mut numbered = Numbered { number: self.next_number, runner, wake_at: None, is_heard: false };
             numbered.settle(&self.epoll);
             self.runners.push(numbered);
             self.next_number += 1;
-        }
-    }
-
-    fn let_go(&mut self) {
-        while let Some(at) = self.runners.iter().position(|numbered| numbered.runner.is_finished()) {
-            self.runners.remove(at).runner.finish();
         }
     }
 }

@@ -134,6 +134,38 @@ pub enum Urgency {
     WantedSelector,
 }
 
+/// How urgent the next question to a device can be at most: enough to see that another one goes first.
+#[derive(Clone, Copy, Debug)]
+pub struct Outlook {
+    /// Nothing is asked before.
+    pub not_before: Time,
+    /// `None`: it has to be looked at.
+    pub reads: Option<ByPeriod>,
+}
+
+/// Of the fast and of the slow reads, when the one began that began longest ago, and its period.
+pub type ByPeriod = [Option<(Time, Duration)>; 2];
+
+impl Outlook {
+    /// `None`: nothing is due.
+    pub fn at_most(&self, now: Time) -> Option<Urgency> {
+        if now < self.not_before {
+            return None;
+        }
+        let Some(reads) = &self.reads else { return Some(Urgency::WantedSelector) };
+        let overdue = reads.iter().flatten().filter(|(began_at, period)| now - *began_at >= *period);
+        overdue
+            .map(|(began_at, period)| periods(now - *began_at, *period))
+            .reduce(f64::max)
+            .map(Urgency::Overdue)
+    }
+}
+
+/// How many of its periods a read has waited.
+fn periods(waited: Duration, period: Duration) -> f64 {
+    waited.as_micros() as u64 as f64 / (period.as_micros() as u64).max(1) as f64
+}
+
 impl Polls {
     /// All of `reads`, each wanted at once. `is_selector` tells the points that others wait for.
     pub fn new(reads: Vec<Read>, intervals: Intervals, is_selector: impl Fn(PointIndex) -> bool) -> Polls {
@@ -192,6 +224,21 @@ impl Polls {
             }
         }
         best
+    }
+
+    /// By which the reads are wanted, if it is only their periods.
+    pub fn by_period(&self, now: Time) -> Option<ByPeriod> {
+        let mut oldest: ByPeriod = [None; 2];
+        for planned in self.reads.iter().filter(|planned| !planned.sleeps) {
+            if planned.wanted_now || planned.is_repeated || now < planned.paused_until {
+                return None;
+            }
+            if let (Some(began_at), Some(period)) = (planned.began_at, planned.period) {
+                let oldest = &mut oldest[usize::from(planned.read.poll == Poll::Slow)];
+                *oldest = (*oldest).filter(|(before, _)| *before <= began_at).or(Some((began_at, period)));
+            }
+        }
+        Some(oldest)
     }
 
     /// The read that has waited longest among those that may begin now, whether it is wanted at once or
@@ -437,11 +484,11 @@ impl Planned {
         }
         let (period, began_at) = (self.period?, self.began_at?);
         let waited = now - began_at;
-        let overdue = |waited: Duration| waited.as_secs_f64() / period.as_secs_f64().max(1e-6);
         if self.is_repeated {
-            return Some(Urgency::Overdue(overdue(waited.saturating_sub(REPEATED_BEHIND)).max(1.0)));
+            let waited = waited.saturating_sub(REPEATED_BEHIND);
+            return Some(Urgency::Overdue(periods(waited, period).max(1.0)));
         }
-        (waited >= period).then(|| Urgency::Overdue(overdue(waited)))
+        (waited >= period).then(|| Urgency::Overdue(periods(waited, period)))
     }
 
     /// For how many of its periods it has waited. What has no period and is wanted counts in tens of seconds,
@@ -450,8 +497,7 @@ impl Planned {
         const NO_PERIOD: Duration = Duration::from_secs(10);
         self.urgency(now)?;
         let Some(began_at) = self.began_at else { return Some(f64::INFINITY) };
-        let period = self.period.unwrap_or(NO_PERIOD).as_secs_f64().max(1e-6);
-        let waited = (now - began_at).as_secs_f64() / period;
+        let waited = periods(now - began_at, self.period.unwrap_or(NO_PERIOD));
         (waited >= 1.0).then_some(waited)
     }
 

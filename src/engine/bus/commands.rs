@@ -104,6 +104,9 @@ impl Bus {
     }
 
     pub(super) fn expire_commands(&mut self) {
+        if self.waiting.next_deadline().is_none_or(|at| self.now < at) {
+            return;
+        }
         for mut waiting in self.waiting.take_expired(self.now) {
             let device = &self.devices[waiting.device];
             let writable_at = device.writable_at(waiting.target);

@@ -24,7 +24,7 @@ use crate::engine::homeassistant::{self, Outline};
 use crate::engine::identity;
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
 use crate::engine::plan::{self, Read, Tariff};
-use crate::engine::schedule::{Pace, Place, Polls, Urgency};
+use crate::engine::schedule::{Outlook, Pace, Place, Polls, Urgency};
 use crate::engine::settings::{DeviceSettings, Eeprom};
 use crate::engine::state::{Absorbed, Values};
 use crate::engine::time::{Duration, Time};
@@ -235,6 +235,12 @@ impl DeviceState {
     /// Whether something is due that only waits until the device has rested.
     pub(super) fn only_rests(&self, now: Time) -> bool {
         now < self.rested_at() && self.is_present() && self.polls.due_at().is_some_and(|due| due <= now)
+    }
+
+    /// How urgent its next question can be at most.
+    pub(super) fn outlook(&self, now: Time) -> Outlook {
+        let reads = if self.is_present() { self.polls.by_period(now) } else { None };
+        Outlook { not_before: self.paused_until.max(self.rested_at()), reads }
     }
 
     pub(super) fn most_urgent(&self, now: Time) -> Option<(Polled, Urgency)> {

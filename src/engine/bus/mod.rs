@@ -7,6 +7,7 @@ mod change;
 mod commands;
 mod context;
 mod device;
+mod devices;
 mod fetch;
 mod inbox;
 mod line;
@@ -39,6 +40,7 @@ pub use commands::STOPPING;
 use commands::{Active, Settling};
 use context::Context;
 use device::{DeviceState, Turn};
+use devices::Devices;
 use fetch::Fetch;
 pub use inbox::{Full, Inbox};
 use recording::Recorder;
@@ -136,7 +138,7 @@ pub struct Bus {
     on_broker_loss: OnBrokerLoss,
     eeprom: Eeprom,
     context: Context,
-    devices: Vec<DeviceState>,
+    devices: Devices,
     waiting: WaitingCommands,
     /// The command that has begun.
     active: Option<Active>,
@@ -260,7 +262,7 @@ impl Bus {
             on_broker_loss: settings.on_broker_loss,
             eeprom: settings.eeprom,
             context,
-            devices,
+            devices: devices.into(),
             waiting: WaitingCommands::default(),
             active: None,
             settling: Vec::new(),
@@ -345,7 +347,7 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let tell_wholes = if self.context.json { &self.devices[..] } else { &[] };
+        let tell_wholes: &[DeviceState] = if self.context.json { &self.devices } else { &[] };
         let wholes = tell_wholes.iter().filter_map(DeviceState::whole_due_at);
         let records = self.record_due_at.into_iter().chain(self.recorder.due_at()).chain(wholes);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {

@@ -304,6 +304,9 @@ impl Bus {
 
     /// Answers the refreshes of which everything has been told.
     pub(super) fn end_refreshes(&mut self) {
+        if self.requests.refreshes.is_empty() {
+            return;
+        }
         let (ended, rest): (Vec<Refresh>, Vec<Refresh>) =
             std::mem::take(&mut self.requests.refreshes).into_iter().partition(|refresh| {
                 let state = &self.devices[refresh.device];
@@ -320,6 +323,9 @@ impl Bus {
 
     pub(super) fn expire_requests(&mut self) {
         let now = self.now;
+        if self.requests_expire_at().is_none_or(|at| now < at) {
+            return;
+        }
         let late = |waiting: &Waiting| waiting.deadline <= now;
         let (expired, rest): (Vec<_>, VecDeque<_>) = {
             let all = std::mem::take(&mut self.requests.waiting).into_iter();

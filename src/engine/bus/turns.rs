@@ -11,6 +11,7 @@ use crate::engine::settings::Link;
 use crate::engine::time::Time;
 
 use super::device::{DeviceState, Polled};
+use super::devices::Next;
 use super::{Action, Bus, GivesWay, InFlight, LinkState, OnBrokerLoss, Purpose};
 
 /// So many requests in a row may go before a read that is due, because somebody wants them at once. Then
@@ -42,17 +43,11 @@ impl Bus {
                 continue;
             }
             let now = self.now;
-            let urgent = self.askable().filter_map(|(index, device)| {
-                device.most_urgent(now).map(|(polled, urgency)| (index, polled, urgency, device.served_at()))
-            });
-            // Of two equally urgent ones, that which has waited longest.
-            let next = urgent.reduce(|best, other| {
-                let better = other.2 > best.2 || (other.2 == best.2 && other.3 < best.3);
-                if better { other } else { best }
-            });
+            let runs_out = self.watchdogs_run_out();
+            let next = self.devices.most_urgent(now, |device| may_ask(device, runs_out));
             let read_before_setting = std::mem::take(&mut self.wrote_setting);
             let read_before_request = self.requests_go_on();
-            let Some((device, polled, ..)) = next else {
+            let Some(Next { device, polled, .. }) = next else {
                 // Nothing is due: the next setting, or question of a request, need not wait for it.
                 if read_before_setting || read_before_request {
                     continue;
@@ -138,14 +133,17 @@ impl Bus {
 
     /// The devices that may be asked something by the bus itself, and their numbers.
     pub(super) fn askable(&self) -> impl Iterator<Item = (usize, &DeviceState)> {
-        self.devices.iter().enumerate().filter(|(_, device)| self.may_ask(device))
+        let runs_out = self.watchdogs_run_out();
+        self.devices.iter().enumerate().filter(move |(_, device)| may_ask(device, runs_out))
     }
 
-    /// Not a device that leaves. And one whose watchdog must run out is not spoken to while the broker is away.
     pub(super) fn may_ask(&self, device: &DeviceState) -> bool {
-        let is_to_be_fed =
-            self.broker_up || self.on_broker_loss == OnBrokerLoss::Keep || !device.wants_feeding();
-        is_to_be_fed && !device.is_leaving
+        may_ask(device, self.watchdogs_run_out())
+    }
+
+    /// Whether devices with a watchdog are left to it, since the broker is away.
+    fn watchdogs_run_out(&self) -> bool {
+        !self.broker_up && self.on_broker_loss != OnBrokerLoss::Keep
     }
 
     /// What any device has.
@@ -247,6 +245,12 @@ impl Bus {
         });
         self.ask(request, now, timeout);
     }
+}
+
+/// Not a device that leaves. And one whose watchdog must run out is not spoken to.
+fn may_ask(device: &DeviceState, watchdogs_run_out: bool) -> bool {
+    let is_left_alone = watchdogs_run_out && device.wants_feeding();
+    !device.is_leaving && !is_left_alone
 }
 
 fn reads_of(call: &Call) -> Option<Span> {

@@ -18,10 +18,16 @@ const TOLD: [usize; 3] = [0, 2, 4];
 /// The buckets that a scraper is told, the one above all bounds included.
 pub const TOLD_BUCKETS: usize = TOLD.len() * DECADES + 1;
 
-/// The upper bound of a bucket, in microseconds.
-const fn bound(bucket: usize) -> u64 {
-    OF_DECADE[bucket % OF_DECADE.len()] * 10u64.pow((bucket / OF_DECADE.len()) as u32)
-}
+/// The upper bound of each bucket, in microseconds.
+const UPPER: [u64; BOUNDS] = {
+    let mut bounds = [0; BOUNDS];
+    let mut bucket = 0;
+    while bucket < BOUNDS {
+        bounds[bucket] = OF_DECADE[bucket % OF_DECADE.len()] * 10u64.pow((bucket / OF_DECADE.len()) as u32);
+        bucket += 1;
+    }
+    bounds
+};
 
 /// Many times of one kind.
 #[derive(Clone, Debug)]
@@ -71,7 +77,7 @@ impl Spread {
     pub fn add(&mut self, now: Time, time: Duration) {
         self.turn_to(now);
         let micros = time.as_micros() as u64;
-        let bucket = (0..BOUNDS).find(|bucket| micros <= bound(*bucket)).unwrap_or(BOUNDS);
+        let bucket = UPPER.partition_point(|bound| *bound < micros);
         self.counts[bucket] = self.counts[bucket].saturating_add(1);
         self.sum += time;
         let young = &mut self.young;
@@ -124,8 +130,8 @@ impl Spread {
             for bucket in 0..BUCKETS {
                 let inside = f64::from(count_of(bucket));
                 if inside > 0.0 && below + inside >= rank {
-                    let from = if bucket == 0 { 0.0 } else { bound(bucket - 1) as f64 };
-                    let to = if bucket < BOUNDS { bound(bucket) as f64 } else { most };
+                    let from = if bucket == 0 { 0.0 } else { UPPER[bucket - 1] as f64 };
+                    let to = if bucket < BOUNDS { UPPER[bucket] as f64 } else { most };
                     // No time lies outside of those that were seen, whatever the bounds are.
                     let (from, to) = (from.clamp(least, most), to.clamp(least, most));
                     return Duration::from_micros(
@@ -144,7 +150,7 @@ impl SpreadReport {
     /// The upper bounds of all but the last count.
     pub fn bounds() -> impl Iterator<Item = Duration> {
         let is_told = |bucket: &usize| TOLD.contains(&(bucket % OF_DECADE.len()));
-        (0..BOUNDS).filter(is_told).map(|bucket| Duration::from_micros(bound(bucket)))
+        (0..BOUNDS).filter(is_told).map(|bucket| Duration::from_micros(UPPER[bucket]))
     }
 }
 

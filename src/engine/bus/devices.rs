@@ -1,0 +1,129 @@
+//! The devices of a bus, and which of them is to be asked next, without a look at each read of each device.
+//!
+//! On a bus with many devices most of them are as they were since the last request. What each of them may
+//! want is therefore kept in few words; whoever can have changed a device makes them be found out anew.
+
+use std::ops::{Deref, DerefMut, Index, IndexMut};
+
+use crate::engine::schedule::{Outlook, Urgency};
+use crate::engine::time::Time;
+
+use super::device::{DeviceState, Polled};
+
+#[derive(Default)]
+pub(super) struct Devices {
+    list: Vec<DeviceState>,
+    /// For each device; `None`: it has been touched.
+    outlooks: Vec<Option<Outlook>>,
+}
+
+/// What is to be asked next, and whom.
+pub(super) struct Next {
+    pub(super) device: usize,
+    pub(super) polled: Polled,
+    pub(super) urgency: Urgency,
+}
+
+impl Devices {
+    /// What is most urgent of all devices that may be asked. Of two equally urgent ones, that which has waited
+    /// longest.
+    pub(super) fn most_urgent(&mut self, now: Time, may_ask: impl Fn(&DeviceState) -> bool) -> Option<Next> {
+        let mut best: Option<Next> = None;
+        for (index, (device, outlook)) in self.list.iter().zip(&mut self.outlooks).enumerate() {
+            let outlook = outlook.get_or_insert_with(|| device.outlook(now));
+            let Some(at_most) = outlook.at_most(now) else { continue };
+            if best.as_ref().is_some_and(|best| at_most < best.urgency) || !may_ask(device) {
+                continue;
+            }
+            let Some((polled, urgency)) = device.most_urgent(now) else { continue };
+            let is_better = best.as_ref().is_none_or(|best| {
+                let waited_longer = device.served_at() < self.list[best.device].served_at();
+                urgency > best.urgency || (urgency == best.urgency && waited_longer)
+            });
+            if is_better {
+                best = Some(Next { device: index, polled, urgency });
+            }
+        }
+        debug_assert_eq!(
+            best.as_ref().map(|best| (best.device, best.urgency)),
+            self.most_urgent_by_looking(now, may_ask),
+            "what is known of the devices is not what they want"
+        );
+        best
+    }
+
+    /// The same by a look at everything, which any test of a bus holds the short way against.
+    fn most_urgent_by_looking(
+        &self,
+        now: Time,
+        may_ask: impl Fn(&DeviceState) -> bool,
+    ) -> Option<(usize, Urgency)> {
+        let askable = self.iter().enumerate().filter(|(_, device)| may_ask(device));
+        let urgent = askable.filter_map(|(index, device)| Some((index, device.most_urgent(now)?.1)));
+        urgent.reduce(|best, other| {
+            let waited_longer = || self[other.0].served_at() < self[best.0].served_at();
+            let is_better = other.1 > best.1 || (other.1 == best.1 && waited_longer());
+            if is_better { other } else { best }
+        })
+    }
+
+    pub(super) fn push(&mut self, device: DeviceState) {
+        self.list.push(device);
+        self.outlooks.push(None);
+    }
+
+    pub(super) fn remove(&mut self, index: usize) -> DeviceState {
+        self.outlooks.remove(index);
+        self.list.remove(index)
+    }
+}
+
+impl From<Vec<DeviceState>> for Devices {
+    fn from(list: Vec<DeviceState>) -> Devices {
+        Devices { outlooks: list.iter().map(|_| None).collect(), list }
+    }
+}
+
+impl Index<usize> for Devices {
+    type Output = DeviceState;
+    fn index(&self, index: usize) -> &DeviceState {
+        &self.list[index]
+    }
+}
+
+impl IndexMut<usize> for Devices {
+    fn index_mut(&mut self, index: usize) -> &mut DeviceState {
+        self.outlooks[index] = None;
+        &mut self.list[index]
+    }
+}
+
+impl Deref for Devices {
+    type Target = [DeviceState];
+    fn deref(&self) -> &[DeviceState] {
+        &self.list
+    }
+}
+
+impl DerefMut for Devices {
+    fn deref_mut(&mut self) -> &mut [DeviceState] {
+        self.outlooks.fill_with(|| None);
+        &mut self.list
+    }
+}
+
+impl<'a> IntoIterator for &'a Devices {
+    type Item = &'a DeviceState;
+    type IntoIter = std::slice::Iter<'a, DeviceState>;
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
+    }
+}
+
+impl<'a> IntoIterator for &'a mut Devices {
+    type Item = &'a mut DeviceState;
+    type IntoIter = std::slice::IterMut<'a, DeviceState>;
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter_mut()
+    }
+}
