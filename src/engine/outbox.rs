@@ -40,6 +40,8 @@ pub struct Outbox {
     /// What was taken away since Home Assistant last said that it listens. If it was not there to
     /// hear, it is told again when it starts.
     departed: BTreeMap<String, Announcement>,
+    /// On which topics what was announced before was told; the broker shall forget those that are ours no more.
+    left_behind: BTreeSet<String>,
     retained: BTreeMap<Arc<str>, Retained>,
     queue: Queue,
     pace: Pace,
@@ -76,6 +78,7 @@ impl Outbox {
             own_devices: own.collect(),
             remembered: BTreeMap::new(),
             departed: BTreeMap::new(),
+            left_behind: BTreeSet::new(),
             retained: BTreeMap::new(),
             queue: Queue::default(),
             pace: Pace::default(),
@@ -113,12 +116,13 @@ impl Outbox {
 
     /// Whether nothing waits.
     pub fn is_empty(&self) -> bool {
-        self.queue.is_empty()
+        self.queue.is_empty() && self.left_behind.is_empty()
     }
 
     fn take_first(&mut self) -> Option<Message> {
         loop {
-            match self.queue.pop_front()? {
+            let Some(queued) = self.queue.pop_front() else { return self.next_left_behind() };
+            match queued {
                 Queued::Once(message) => return Some(*message),
                 Queued::Removal(topic) => return Some(Message::retained(topic, "")),
                 Queued::Newest(topic) => {

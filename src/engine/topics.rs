@@ -102,6 +102,12 @@ impl Topics {
         format!("{}/bridge/info", self.base)
     }
 
+    /// Whether this topic is below the base topic, and not the bridge's own.
+    pub fn are_above(&self, topic: &str) -> bool {
+        let below = topic.strip_prefix(self.base.as_str()).and_then(|rest| rest.strip_prefix('/'));
+        below.is_some_and(|below| !below.starts_with("bridge/"))
+    }
+
     /// Retained.
     pub fn bridge_health(&self) -> String {
         format!("{}/bridge/health", self.base)

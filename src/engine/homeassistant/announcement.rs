@@ -1,6 +1,6 @@
 //! One discovery message for each Modbus device, and the farewell to what it no longer has.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
 
 use serde_json::{Map, Value, json};
@@ -111,6 +111,16 @@ impl Announcement {
         self.components.iter().map(|(key, component)| {
             (key.as_str(), component.get("platform").and_then(Value::as_str).unwrap_or_default())
         })
+    }
+
+    /// The topics on which what it announces is told.
+    pub fn told_on(&self) -> BTreeSet<&str> {
+        let availability = self.head.get("availability").and_then(Value::as_array).into_iter().flatten();
+        let availability = availability.filter_map(|entry| entry.get("topic"));
+        let keys = self.components.iter().flat_map(|(_, component)| component);
+        let is_told = |key: &str| key.ends_with("_topic") && !key.ends_with("command_topic");
+        let told = keys.filter(|(key, _)| is_told(key)).map(|(_, topic)| topic);
+        availability.chain(told).filter_map(Value::as_str).collect()
     }
 
     /// Nothing to announce: such a device is better not mentioned at all, since Home Assistant takes

@@ -11,6 +11,14 @@ impl Outbox {
     /// have any more is taken away properly; announcements that are not ours are left alone.
     pub fn found(&mut self, topic: &str, payload: &str) {
         let Some(found) = Announcement::parse(&self.topics, topic, payload) else { return };
+        for topic in found.told_on() {
+            self.left_behind.insert(topic.to_string());
+            // What stands beside it without being announced.
+            if let Some(device) = topic.strip_suffix("/availability") {
+                let beside = [device.to_string(), format!("{device}/info"), format!("{device}/health")];
+                self.left_behind.extend(beside);
+            }
+        }
         if self.retained.contains_key(topic) {
             self.take_leave(found);
         } else if self.own_devices.contains(topic) {
@@ -19,6 +27,24 @@ impl Outbox {
             // Not twice, if both the broker and we remember it: Home Assistant warns of the second time.
             self.queue_last(Queued::Removal(topic.to_string()));
         }
+    }
+
+    /// The next topic on which an earlier run told something, and this one tells nothing: a point that is
+    /// gone, or another layout. To be asked when everything has been told, for only then it is known.
+    pub(super) fn next_left_behind(&mut self) -> Option<Message> {
+        while let Some(topic) = self.left_behind.pop_first() {
+            if self.topics.are_above(&topic) && !self.is_told(&topic) {
+                return Some(Message::retained(topic, ""));
+            }
+        }
+        None
+    }
+
+    /// Whether something stands on this topic, or may: how a device does is told after a minute, and all its
+    /// values in one message perhaps.
+    fn is_told(&self, topic: &str) -> bool {
+        let device = topic.strip_suffix("/health").unwrap_or(topic);
+        [topic, &format!("{device}/availability")].iter().any(|topic| self.retained.contains_key(*topic))
     }
 
     /// Buries what `found` has and the present announcement on its topic has not.
@@ -65,6 +91,32 @@ mod tests {
              \"components\":{{{}}}}}",
             components.join(",")
         )
+    }
+
+    #[test]
+    fn what_an_earlier_run_told_on_topics_that_are_ours_no_more_is_forgotten_when_all_else_is_told() {
+        let config = "homeassistant/device/busker_boiler/config";
+        let with = |topics: &[&str]| {
+            let components: Vec<String> = topics
+                .iter()
+                .map(|topic| format!("\"{topic}\":{{\"platform\":\"switch\",\"state_topic\":\"{topic}\",\"command_topic\":\"{topic}/set\"}}"))
+                .collect();
+            format!(
+                "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
+                 \"components\":{{{}}}}}",
+                components.join(",")
+            )
+        };
+        let mut outbox = outbox();
+        let told = ["busker/boiler/flow", "busker/boiler/health", "busker/bridge/health"];
+        outbox.found(config, &with(&[&told[..], &["busker/boiler/old", "elsewhere/x"]].concat()));
+        retained(&mut outbox, "busker/boiler/availability", "online");
+        retained(&mut outbox, "busker/boiler/flow", "21.5");
+        check_sent(
+            &mut outbox,
+            &["busker/boiler/availability online", "busker/boiler/flow 21.5", "busker/boiler/old "],
+        );
+        check_sent(&mut outbox, &[]);
     }
 
     #[test]
