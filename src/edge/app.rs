@@ -274,8 +274,11 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
             shutdown::feed_watchdog();
         }
         if reporter.is_changing() {
-            // Not all buses are there; when they are, it is told at once.
+            // Not all buses are there; when they are, it is told. Whoever changes them stirs at the end, and
+            // has to come to that: this must wait, too, where there is no bus that could be waited for.
             (seen, told) = (None, None);
+            stirs(&plant, now, now + pause, pause).await;
+            has_stirred = true;
             continue;
         }
         let (topics, mailbox) = (plant.topics(), plant.mailbox());
