@@ -93,15 +93,10 @@ impl Budget {
     fn load_at(&self, stretch: f64) -> f64 {
         let of_device = |(device, wants): (usize, &Wants)| {
             let reads = self.reads.iter().filter(|read| read.device == device);
+            let stretch = stretch.max(self.rests(device));
             match wants.fed_every {
-                None => {
-                    let stretch = stretch.max(self.rests(device));
-                    reads.filter_map(Planned::load).sum::<f64>() / stretch + wants.load_of_beats()
-                }
-                Some(every) => {
-                    let stretch = stretch.max(self.rests(device));
-                    round::load(&reads.collect::<Vec<_>>(), &wants.beats, every, stretch)
-                }
+                None => reads.filter_map(Planned::load).sum::<f64>() / stretch + wants.load_of_beats(),
+                Some(every) => round::load(&reads.collect::<Vec<_>>(), &wants.beats, every, stretch),
             }
         };
         self.wants.iter().enumerate().map(of_device).sum()

@@ -34,16 +34,17 @@ pub(super) struct Settling {
     /// When it goes on, mostly to be read back with a request of its own.
     until: Time,
     pub(super) active: Active,
-    /// A poll that begins from now on answers as well.
-    by_poll: bool,
-    /// What is asked then, if it is not read back yet.
-    next: Option<Call>,
+    then: Then,
 }
 
-impl Settling {
-    fn and_then(until: Time, active: Active, next: Call) -> Settling {
-        Settling { until, active, by_poll: false, next: Some(next) }
-    }
+/// How a command goes on.
+enum Then {
+    /// It is read back.
+    ReadBack,
+    /// The same, if no poll that begins from now on has brought it before.
+    ReadBackUnlessPolled,
+    /// This is asked.
+    Ask(Call),
 }
 
 /// What commands and requests are told that a bus leaves behind when it ends: it does not know which of the two
@@ -162,8 +163,8 @@ impl Bus {
         let all = std::mem::take(&mut self.settling).into_iter();
         let (ended, rest): (Vec<_>, Vec<_>) = all.partition(|settling| is_of_it(&settling.active));
         self.settling = rest;
-        for Settling { active, next, .. } in ended {
-            let is_unwritten = next.is_some_and(|call| call.is_write());
+        for Settling { active, then, .. } in ended {
+            let is_unwritten = matches!(then, Then::Ask(call) if call.is_write());
             let what = if is_unwritten { "not written" } else { "written, but not read back" };
             let outcome = active.wanted.ended(OutcomeKind::NoReply, format!("{what}: {reason}"));
             self.end_command(active, outcome);
@@ -177,8 +178,8 @@ impl Bus {
             return false;
         }
         if let Some(at) = self.settling.iter().position(|settling| settling.until <= self.now) {
-            let Settling { mut active, next, .. } = self.settling.remove(at);
-            if let Some(call) = next {
+            let Settling { mut active, then, .. } = self.settling.remove(at);
+            if let Then::Ask(call) = then {
                 self.take_step(active, Step::Ask(call));
                 return true;
             }
@@ -273,7 +274,7 @@ impl Bus {
         match step {
             // It goes on with another connection.
             Step::Ask(call) if self.link_state == LinkState::Renewing => {
-                self.settling.push(Settling::and_then(self.now, active, call));
+                self.settling.push(Settling { until: self.now, active, then: Then::Ask(call) });
             }
             Step::Ask(_) if self.link_state != LinkState::Up => {
                 let mut active = active;
@@ -284,12 +285,8 @@ impl Bus {
             }
             Step::Ask(_) if self.next_poll_confirms(&active) => {
                 self.devices[device].want_poll(point);
-                self.settling.push(Settling {
-                    until: self.now + POLL_AWAITED,
-                    active,
-                    by_poll: true,
-                    next: None,
-                });
+                let until = self.now + POLL_AWAITED;
+                self.settling.push(Settling { until, active, then: Then::ReadBackUnlessPolled });
             }
             Step::Ask(call) => {
                 if let (true, Some(reason)) =
@@ -309,10 +306,10 @@ impl Bus {
                 self.send(device, call, Purpose::Command);
             }
             Step::Settle(time) => {
-                self.settling.push(Settling { until: self.now + time, active, by_poll: false, next: None });
+                self.settling.push(Settling { until: self.now + time, active, then: Then::ReadBack });
             }
             Step::AskLater(time, call) => {
-                self.settling.push(Settling::and_then(self.now + time, active, call));
+                self.settling.push(Settling { until: self.now + time, active, then: Then::Ask(call) });
             }
             Step::Finished(outcome) => {
                 let is_done = matches!(outcome.kind, OutcomeKind::Done | OutcomeKind::Unchanged);
@@ -340,13 +337,14 @@ impl Bus {
     /// A poll of a device has brought these words for `span`, or nothing.
     pub(super) fn poll_ended(&mut self, device: usize, span: Span, words: Option<&[u16]>) {
         let is_read_back = |settling: &Settling, devices: &[DeviceState]| {
-            let is_of_it = settling.by_poll && settling.active.device == device;
+            let awaits_poll = matches!(settling.then, Then::ReadBackUnlessPolled);
+            let is_of_it = awaits_poll && settling.active.device == device;
             is_of_it && span.contains(devices[device].details(settling.active.flow.point()).at.span)
         };
         let Some(words) = words else {
             for settling in &mut self.settling {
                 if is_read_back(settling, &self.devices) {
-                    (settling.until, settling.by_poll) = (self.now, false);
+                    (settling.until, settling.then) = (self.now, Then::ReadBack);
                 }
             }
             return;

@@ -2,7 +2,7 @@
 //! nobody was there to hear.
 
 use crate::engine::homeassistant::{self, Announcement};
-use crate::engine::topics::Message;
+use crate::engine::topics::{DeviceTopics, Message};
 
 use super::{Outbox, Queued};
 
@@ -14,9 +14,8 @@ impl Outbox {
         for topic in found.told_on() {
             self.left_behind.insert(topic.to_string());
             // What stands beside it without being announced.
-            if let Some(device) = topic.strip_suffix("/availability") {
-                let beside = [device.to_string(), format!("{device}/info"), format!("{device}/health")];
-                self.left_behind.extend(beside);
+            if let Some(device) = DeviceTopics::with_availability_on(topic) {
+                self.left_behind.extend([device.json().to_string(), device.info(), device.health()]);
             }
         }
         if self.retained.contains_key(topic) {
@@ -43,8 +42,8 @@ impl Outbox {
     /// Whether something stands on this topic, or may: how a device does is told after a minute, and all its
     /// values in one message perhaps.
     fn is_told(&self, topic: &str) -> bool {
-        let device = topic.strip_suffix("/health").unwrap_or(topic);
-        [topic, &format!("{device}/availability")].iter().any(|topic| self.retained.contains_key(*topic))
+        let device = DeviceTopics::with_health_on(topic).unwrap_or_else(|| DeviceTopics::with_json_on(topic));
+        [topic, &device.availability()].iter().any(|topic| self.retained.contains_key(*topic))
     }
 
     /// Buries what `found` has and the present announcement on its topic has not.
