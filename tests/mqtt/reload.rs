@@ -9,7 +9,7 @@ use std::thread;
 use busker::edge::clock::Clock;
 use busker::engine::time::{Duration, Time};
 
-use crate::support::{self, Broker, Gateway, Received, Watcher, find};
+use crate::support::{Broker, Gateway, Received, Watcher, find};
 use crate::{json, over_tcp, remembered, simulation};
 
 /// A server of Modbus TCP that answers every read with zeros and remembers when it was asked.
@@ -216,17 +216,34 @@ fn a_faulty_configuration_changes_nothing_and_is_shown_where_people_look() {
 }
 
 #[test]
+fn everything_begins_anew_also_after_a_long_calm() {
+    let (broker, simulation, witness) = (Broker::start(), simulation(), Witness::start());
+    let port = over_tcp(&simulation);
+    let (steady, pump) = steady(&witness);
+    let line = format!("line: {{tcp: '{}'}}", port.address());
+    let watcher = Watcher::start(&broker, "watcher");
+    let before = text(&broker, &[&line, &steady], &[RELAYS, &pump]);
+    let gateway = Gateway::start_with(&before);
+    online(&watcher, &["relays", "pump"]);
+    // Whoever looks at the gateway when something stirs does so at most once a second: only after a calm he
+    // looks at once, and sees that there is no bus.
+    witness.wait_for_more(12);
+    gateway.write(&before.replace("mqtt: {", "mqtt: {base_topic: house, "));
+    gateway.reload(DONE);
+    watcher.wait_for("house/relays/availability", "online");
+    assert!(gateway.terminate().success());
+}
+
+#[test]
 fn another_broker_or_another_base_topic_is_taken_without_a_restart() {
     let (old, new, witness) = (Broker::start(), Broker::start(), Witness::start());
     let (steady, pump) = steady(&witness);
     let (of_old, of_new) = (Watcher::start(&old, "watcher"), Watcher::start(&new, "watcher"));
-    let with =
-        |broker: &Broker| text(broker, &[&steady], &[&pump]).replace("buses:", "republish: 1s\nbuses:");
-    let gateway = Gateway::start_with(&with(&old));
+    let gateway = Gateway::start_with(&text(&old, &[&steady], &[&pump]));
     online(&of_old, &["pump"]);
     let from = witness.count();
 
-    gateway.write(&with(&new));
+    gateway.write(&text(&new, &[&steady], &[&pump]));
     gateway.reload(DONE);
     of_old.wait_for("busker/bridge/state", "offline");
     of_new.wait_for("busker/bridge/state", "online");
@@ -236,10 +253,7 @@ fn another_broker_or_another_base_topic_is_taken_without_a_restart() {
     let longest = witness.longest_gap(from);
     assert!(longest < Duration::from_millis(600), "a poll was lost: {longest:?}");
 
-    // Long after anything has happened whoever looks at the gateway looks at once, and there is no bus.
-    let is_calm = || (of_new.payloads("busker/pump/flow").len() >= 4).then_some(());
-    support::find(is_calm).expect("it is told each second");
-    gateway.write(&with(&new).replace("mqtt: {", "mqtt: {base_topic: house, "));
+    gateway.write(&text(&new, &[&steady], &[&pump]).replace("mqtt: {", "mqtt: {base_topic: house, "));
     gateway.reload(DONE);
     of_new.wait_for("busker/bridge/state", "offline");
     of_new.wait_for("house/bridge/state", "online");
