@@ -330,6 +330,9 @@ fn read_float(resolved: &Resolved<'_>, raw: f64) -> Reading {
         let digits = if form.kind == Kind::F32 { 6 } else { 14 };
         value = format!("{value:.digits$e}").parse().unwrap_or(value);
     }
+    if !is_told(value) {
+        return Reading::Missing(Missing::NotANumber);
+    }
     let Some(decimals) = resolved.decimals else {
         // Minus zero is told as zero.
         return Reading::Float(value + 0.0);
@@ -341,6 +344,12 @@ fn read_float(resolved: &Resolved<'_>, raw: f64) -> Reading {
         // Too large for a decimal, so that it has no digits behind the dot anyway.
         None => Reading::Float(text.parse().unwrap_or(value) + 0.0),
     }
+}
+
+/// Whether the number can be told without an exponent in the 255 characters that a state in Home Assistant may have.
+/// What is beyond comes of words in the wrong order.
+fn is_told(number: f64) -> bool {
+    number == 0.0 || (1e-230..1e250).contains(&number.abs())
 }
 
 #[cfg(test)]

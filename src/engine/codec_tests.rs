@@ -91,6 +91,11 @@ fn floats_are_told_shortest_and_without_exponent() {
     check_read(two_digits(), "60AD 78EC", "100000000000000000000.00");
     let beyond_a_decimal = with(Kind::F64, |form| form.decimals = Some(Decimals::Fixed(1)));
     check_read(beyond_a_decimal, "47EF FFFF E091 FF3D", "340282347000000000000000000000000000000");
+    // A number that scaling makes too large, and what would be told with hundreds of digits.
+    check_read(with(Kind::F64, |form| form.scale = decimal("1000")), "7FE1 CCF3 85EB C8A0", "None");
+    check_read(Form::new(Kind::F64), "7FE1 CCF3 85EB C8A0", "None");
+    check_read(Form::new(Kind::F64), "0000 0000 0000 0001", "None");
+    check_read(Form::new(Kind::F64), "0000 0000 0000 0000", "0");
 }
 
 #[test]

@@ -8,7 +8,7 @@ use crate::engine::codec::{self, Raw};
 use crate::engine::device::{Device, Point, PointIndex};
 use crate::engine::plan::Read;
 use crate::engine::time::{Duration, Time};
-use crate::engine::value::{Missing, Reading};
+use crate::engine::value::{Decimal, Missing, Reading};
 
 /// The last reading of each point of one device.
 #[derive(Clone, Debug)]
@@ -345,17 +345,24 @@ fn known_field(point: &Point, field: &[u16]) -> Option<i128> {
     }
 }
 
+/// Whether the reading is worth telling to who was told the other one.
 fn differs(told: &Reading, reading: &Reading, point: &Point) -> bool {
-    let number = |reading: &Reading| match reading {
-        Reading::Number(number) => Some(number.to_f64()),
-        Reading::Float(number) => Some(*number),
-        Reading::Moment(moment) => Some(moment.seconds().to_f64()),
-        _ => None,
-    };
     match (number(told), number(reading), point.deadband) {
-        (Some(before), Some(after), Some(deadband)) => (after - before).abs() >= deadband.to_f64(),
+        // Exact: between 0.2 and 0.3 lies 0.1, of which the difference of two doubles falls short.
+        (Some(before), Some(after), Some(deadband)) => {
+            after.checked_add(before.negated()).is_none_or(|apart| apart.absolute().compare(deadband).is_ge())
+        }
         // Compared as told: the reason why something is missing belongs to the device's info.
         _ => told.to_string() != reading.to_string(),
+    }
+}
+
+fn number(reading: &Reading) -> Option<Decimal> {
+    match reading {
+        Reading::Number(number) => Some(*number),
+        Reading::Float(number) => Decimal::nearest(*number),
+        Reading::Moment(moment) => Some(moment.seconds()),
+        _ => None,
     }
 }
 
@@ -365,6 +372,7 @@ mod tests {
     use crate::engine::address::{Span, Table};
     use crate::engine::device::Poll;
     use crate::engine::test_device::device_of;
+    use crate::engine::value::Moment;
 
     const REPUBLISH: Duration = Duration::from_secs(60);
 
@@ -418,6 +426,53 @@ mod tests {
         let now = Time::from_millis(81_000);
         assert_eq!(values.tell(now, 1, &device.points[1], REPUBLISH, false).as_deref(), Some("None"));
         assert_eq!(told(&mut values, &device, &read, 82, &[1, 3]), ["3"]);
+    }
+
+    #[test]
+    fn what_differs_by_the_deadband_or_more_from_what_was_told_is_told() {
+        let number = |text: &str| Reading::Number(Decimal::parse(text).expect("a decimal"));
+        let moment = |seconds| Reading::Moment(Moment::new(Decimal::integer(seconds)).expect("a moment"));
+        let (device, _) = two_registers();
+        let check = |deadband: &str, readings: Vec<Reading>, expected: &[&str]| {
+            let mut values = Values::new(&device);
+            let mut point = device.points[0].clone();
+            point.deadband = Decimal::parse(deadband);
+            let told = readings.into_iter().enumerate().filter_map(|(second, reading)| {
+                values.set(0, reading);
+                values.tell(Time::from_millis(second as u64 * 1000), 0, &point, REPUBLISH, false)
+            });
+            assert_eq!(told.collect::<Vec<_>>(), expected, "{deadband}");
+        };
+        // As doubles, 0.3 - 0.2 is less than 0.1.
+        check("0.1", vec![number("0.2"), number("0.3"), number("0.2")], &["0.2", "0.3", "0.2"]);
+        check("0.1", vec![number("0.20"), number("0.29"), number("0.11"), number("0.10")], &["0.20", "0.10"]);
+        check("0.1", vec![Reading::Float(0.2), Reading::Float(0.3), Reading::Float(0.39)], &["0.2", "0.3"]);
+        // From what was told, not from the reading before: what creeps arrives.
+        check("1", (0..25).map(|tenth| number(&format!("2.{tenth:02}"))).collect(), &["2.00"]);
+        check(
+            "0.1",
+            (0..25).map(|tenth| number(&format!("2.{tenth:02}"))).collect(),
+            &["2.00", "2.10", "2.20"],
+        );
+        check(
+            "60",
+            vec![moment(1000), moment(1059), moment(1060)],
+            &["1970-01-01T00:16:40+00:00", "1970-01-01T00:17:40+00:00"],
+        );
+        // What is missing, or is there again, is told however near the number is.
+        let gone = || Reading::Missing(Missing::Exception(4));
+        check("5", vec![number("20.0"), gone(), gone(), number("20.1")], &["20.0", "None", "20.1"]);
+        check(
+            "5",
+            vec![number("20.0"), Reading::Name("automatic".into()), number("20.0")],
+            &["20.0", "automatic", "20.0"],
+        );
+        let large = Reading::Float(1e200);
+        check(
+            "5",
+            vec![Reading::Float(0.0), Reading::Float(f64::from_bits(1)), large.clone()],
+            &["0", &large.to_string()],
+        );
     }
 
     #[test]

@@ -101,6 +101,18 @@ impl Decimal {
         Decimal { units: -self.units, ..self }
     }
 
+    pub fn absolute(self) -> Decimal {
+        if self.units < 0 { self.negated() } else { self }
+    }
+
+    /// The decimal by which a float is told, without the digits that are beyond what a decimal holds; `None` for one
+    /// that is too large.
+    pub fn nearest(number: f64) -> Option<Decimal> {
+        let decimals = usize::from(Decimal::DECIMALS_MAX);
+        let told = number.to_string();
+        Decimal::parse(&told).or_else(|| Decimal::parse(&format!("{number:.decimals$}")))
+    }
+
     /// `self ÷ divisor` as a whole number, only if nothing is left over.
     pub fn divided_exactly_by(self, divisor: Decimal) -> Option<i128> {
         let decimals = self.decimals.max(divisor.decimals);
