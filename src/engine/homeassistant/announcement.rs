@@ -5,8 +5,10 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use serde_json::{Map, Value, json};
 
+use super::beside::companions;
 use super::diagnostics::Place;
-use super::entity::{Entity, companions, entity, sentence};
+use super::entity::Entity;
+use super::point::{entity, sentence};
 use super::release;
 use super::thing::thing_component;
 use crate::engine::device::{Platform, Poll, ThingKind};

@@ -7,7 +7,7 @@ use std::ops::Deref;
 use serde_json::{Map, Value, json};
 
 use super::announcement::name_beside;
-use super::entity::sentence;
+use super::point::sentence;
 use crate::engine::codec;
 use crate::engine::device::{Device, PRESS, Point, PointIndex, Thing, ThingKind};
 use crate::engine::settings::DeviceSettings;
