@@ -32,7 +32,6 @@ use crate::engine::topics::{Message, Topics};
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// How often each bus is asked although nothing has stirred: it may be stuck.
 const ASK_EVERY: Duration = Duration::from_secs(10);
-const TELL_HEALTH_EVERY: Duration = Duration::from_secs(60);
 
 /// How long the buses may take to finish what is in flight.
 pub(super) const BUSES_END_WITHIN: Duration = Duration::from_secs(10);
@@ -290,7 +289,7 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
         let is_time = now >= tell_at || told_at != places;
         told_at = places;
         if is_time {
-            tell_at = now + TELL_HEALTH_EVERY;
+            tell_at = now + health::TOLD_EVERY;
         }
         if is_time || told.as_ref() != Some(&states) {
             mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));

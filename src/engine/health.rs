@@ -12,6 +12,9 @@ use crate::engine::device::{Category, Point, Poll};
 use crate::engine::modbus::{Discarded, RequestError};
 use crate::engine::time::{Duration, Time};
 
+/// How often the health of the gateway and of each device is told, changed or not.
+pub const TOLD_EVERY: Duration = Duration::from_secs(60);
+
 /// The codes of the specification end with 11.
 const EXCEPTION_CODES: usize = 12;
 

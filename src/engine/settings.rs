@@ -65,6 +65,8 @@ pub struct HomeAssistant {
     pub status_topic: String,
     /// The oldest that must understand what it is told.
     pub minimum_version: Release,
+    /// After this an entity of which nothing is told is unavailable; `None`: never.
+    pub expire_after: Option<Duration>,
 }
 
 #[derive(Clone, PartialEq, Eq)]

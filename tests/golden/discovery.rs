@@ -121,6 +121,7 @@ fn payload(device: &Device, known: &[Option<i128>]) -> Value {
         prefix: "homeassistant".into(),
         release: Release::USUAL,
         retains: true,
+        expire_after: None,
     };
     let settings = DeviceSettings {
         name: "device".into(),

@@ -55,6 +55,7 @@ pub fn settings(header: &str) -> Settings {
             prefix: "homeassistant".into(),
             status_topic: "homeassistant/status".into(),
             minimum_version: Release::USUAL,
+            expire_after: None,
         },
         http: Http { listen: None, token: Password::None },
         state_dir: "/nowhere".into(),

@@ -108,6 +108,9 @@ record! {
         /// The oldest Home Assistant that is to understand it, in quotes: `"2025.4"`. An older one knows fewer
         /// device classes, and takes ids under another name.
         minimum_version: At<Release> = At::nowhere(Release::USUAL),
+        /// After this a sensor of which nothing was told is unavailable: for a broker that may end together with
+        /// the gateway and comes back alone. At least three times `republish`; never unless said.
+        expire_after: Option<At<Duration>>,
     }
 }
 

@@ -127,7 +127,10 @@ impl Resolver<'_> {
             );
         }
         self.within(file.republish.get(), Duration::from_secs(1), Duration::from_secs(86_400));
-        let home_assistant = section(&file.home_assistant).map(|section| home_assistant(&section));
+        let home_assistant = section(&file.home_assistant).map(|section| {
+            self.expiry(&section, file.republish.get());
+            home_assistant(&section)
+        });
         self.release = home_assistant.as_ref().map_or(Release::USUAL, |section| section.minimum_version);
         let mqtt = section(&file.mqtt).map(|mqtt| self.mqtt(&mqtt));
         let eeprom = section(&file.eeprom).map(|eeprom| self.eeprom(&eeprom));
@@ -148,6 +151,22 @@ impl Resolver<'_> {
             buses,
             devices,
         })
+    }
+
+    /// What has not changed is told once in `republish`, and two such messages may be lost.
+    fn expiry(&mut self, file: &file::HomeAssistant, republish: Option<&At<Duration>>) {
+        let (Some(expiry), Some(republish)) = (&file.expire_after, republish) else { return };
+        self.within(Some(expiry), Duration::from_secs(1), Duration::from_secs(7 * 86_400));
+        let least = republish.value * 3;
+        if expiry.value < least {
+            let message = format!(
+                "what has not changed is told once in {} (`republish`), and would expire meanwhile; expected at least \
+                 {}, or a shorter `republish`",
+                told(republish.value),
+                told(least)
+            );
+            self.faults.add(&expiry.place, message);
+        }
     }
 
     fn eeprom(&mut self, file: &file::Eeprom) -> Eeprom {
@@ -506,6 +525,7 @@ fn home_assistant(file: &file::HomeAssistant) -> HomeAssistant {
         prefix: file.prefix.0.clone(),
         status_topic: file.status_topic.0.clone(),
         minimum_version: file.minimum_version.value,
+        expire_after: file.expire_after.as_ref().map(|at| at.value),
     }
 }
 

@@ -107,7 +107,7 @@ fn every_key_has_its_place() {
         "
 mqtt: {url: 'mqtt://[fe80::1]:1884', username: busker, password_file: /p, base_topic: house/busker,
        keep_alive: 1m}
-home_assistant: {discovery: false, prefix: ha, status_topic: ha/up, minimum_version: '2025.4'}
+home_assistant: {discovery: false, prefix: ha, status_topic: ha/up, minimum_version: '2025.4', expire_after: 3h}
 http: {listen: 'localhost:0', token: s3cret}
 state_dir: /tmp/state
 republish: 1h
@@ -131,6 +131,7 @@ devices:
             prefix: "ha".into(),
             status_topic: "ha/up".into(),
             minimum_version: Release::OLDEST,
+            expire_after: Some(Duration::from_secs(10_800)),
         }
     );
     assert_eq!(settings.http.listen.as_deref(), Some("localhost:0"));
@@ -170,6 +171,7 @@ fn what_is_left_out_has_the_documented_default() {
     assert_eq!((settings.mqtt.base_topic.as_str(), settings.mqtt.username), ("busker", None));
     assert!(settings.home_assistant.discovery);
     assert_eq!(settings.home_assistant.status_topic, "homeassistant/status");
+    assert_eq!(settings.home_assistant.expire_after, None);
     assert_eq!(settings.http.listen.as_deref(), Some("127.0.0.1:8485"));
     assert_eq!(settings.state_dir, PathBuf::from("/var/lib/busker"));
     assert_eq!(settings.republish, Duration::from_secs(600));

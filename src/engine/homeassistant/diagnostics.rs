@@ -16,6 +16,8 @@ pub(super) struct Place<'p> {
     pub object: &'p str,
     /// The message may come without the object: what the broker keeps may be older than what it tells of.
     pub may_lack: bool,
+    /// The seconds after which they are unavailable if nothing is told.
+    pub expiry: Option<u64>,
 }
 
 /// Entities of this device, in their order.
@@ -53,6 +55,7 @@ impl Place<'_> {
             "value_template": self.template(value, "none"),
         }));
         component.extend(object(more));
+        component.extend(self.expiry.map(|seconds| ("expire_after".into(), seconds.into())));
         (key, component)
     }
 

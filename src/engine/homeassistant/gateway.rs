@@ -4,6 +4,7 @@ use serde_json::json;
 
 use super::announcement::{Announcement, Gateway};
 use super::diagnostics::{Place, object};
+use crate::engine::health::TOLD_EVERY;
 use crate::engine::topics::{OFFLINE, ONLINE};
 
 /// The gateway: one entity that says whether it is connected. Announced before all others, which
@@ -57,6 +58,7 @@ pub fn announce_bus(gateway: &Gateway, bus: &str) -> Announcement {
         object: &object,
         // A bus is announced before it is told of, and the health of before may be all that the broker has.
         may_lack: true,
+        expiry: gateway.expiry(TOLD_EVERY),
     };
     let link = json!({"device_class": "connectivity"});
     let load =

@@ -2,12 +2,13 @@
 //! say, never of values.
 //!
 //! `entity` is one of them. `point` derives what one point is there, `beside` the buttons beside it, `thing` what
-//! several points are together; `announcement` puts the entities of a device into its one discovery message,
-//! `gateway` does the same for the gateway itself and its buses; `release` says it so that an older Home Assistant
-//! understands it.
+//! several points are together; `device` puts them into the device's one discovery message, `gateway` does the same
+//! for the gateway itself and its buses, and `announcement` is that message; `release` says it so that an older Home
+//! Assistant understands it.
 
 mod announcement;
 mod beside;
+mod device;
 mod diagnostics;
 mod entity;
 mod gateway;
@@ -15,9 +16,13 @@ mod point;
 mod release;
 mod thing;
 
-pub use announcement::{Announcement, Gateway, Outline, announcement, farewell};
+pub use announcement::{Announcement, Gateway, Outline, farewell};
 pub use beside::companions;
+pub use device::announcement;
 pub use entity::Entity;
 pub use gateway::{announce_bridge, announce_bus};
 pub use point::{entity, is_settled, sentence};
 pub use thing::name_of_thing;
+
+#[cfg(test)]
+mod tests;

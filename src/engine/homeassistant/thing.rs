@@ -6,7 +6,7 @@ use std::ops::Deref;
 
 use serde_json::{Map, Value, json};
 
-use super::announcement::name_beside;
+use super::device::name_beside;
 use super::point::sentence;
 use crate::engine::codec;
 use crate::engine::device::{Device, PRESS, Point, PointIndex, Thing, ThingKind};
