@@ -121,6 +121,10 @@ fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
     };
     let mut line = vec![args.place.clone(), outcome.kind.name().to_owned()];
     line.extend(outcome.found.map(|found| format!("the device holds {found}")));
+    // Where it is not written as it was wished, or stood there already.
+    if matches!(outcome.kind, OutcomeKind::Done | OutcomeKind::Unchanged) {
+        line.extend(outcome.reason.clone());
+    }
     output::print(&format!("{}\n", line.join("  ")))?;
     match outcome.kind {
         OutcomeKind::Done | OutcomeKind::Unchanged => Ok(()),

@@ -1,6 +1,7 @@
 //! Starts what runs and ends it in order: the threads of the buses, and a small runtime for the broker and
 //! HTTP.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
@@ -21,8 +22,9 @@ use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
 use crate::engine::health::{self, BusReport, DeviceReport, GatewayReport};
 use crate::engine::homeassistant::{self, Gateway};
-use crate::engine::outbox::Outbox;
+use crate::engine::outbox::{Outbox, Tree};
 use crate::engine::profile::Library;
+use crate::engine::reload;
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 use crate::engine::topics::{Message, Topics};
@@ -32,6 +34,9 @@ use crate::engine::topics::{Message, Topics};
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// How often each bus is asked although nothing has stirred: it may be stuck.
 const ASK_EVERY: Duration = Duration::from_secs(10);
+
+/// Everything was told, and the broker has most likely taken it, when it is so at so many looks.
+const LOOKS_UNTIL_STORED: u32 = 2;
 
 /// How long the buses may take to finish what is in flight.
 pub(super) const BUSES_END_WITHIN: Duration = Duration::from_secs(10);
@@ -138,13 +143,26 @@ impl App {
     }
 }
 
-/// What Home Assistant still has of an earlier run, whatever the broker has forgotten.
+/// What Home Assistant and the broker still have of earlier runs, whatever the broker has forgotten.
 fn recall(plant: &Plant, state: &StateFiles) {
-    if plant.settings().home_assistant.discovery {
-        plant.mailbox().change(|outbox| {
-            state.take_announced().iter().for_each(|(topic, payload)| outbox.recall(topic, payload));
-        });
-    }
+    let wanted = reload::topics_of_devices(&plant.settings());
+    plant.mailbox().change(|outbox| outbox.recall(state.take_announced(), state.take_trees(), &wanted));
+    remember_topics(plant, state, BTreeSet::new());
+}
+
+/// Stores where something is told from now on, and what is to be taken back: `gone` and what waits for that.
+pub(super) fn remember_topics(plant: &Plant, state: &StateFiles, gone: BTreeSet<String>) {
+    let settings = plant.settings();
+    let mut topics = reload::topics_of_devices(&settings);
+    topics.extend(gone);
+    let base_topic = settings.mqtt.base_topic.clone();
+    let trees = plant.mailbox().look(|outbox| {
+        let (left_behind, formers) = outbox.left_behind();
+        topics.extend(left_behind.iter().cloned());
+        let present = Tree { base_topic, topics };
+        std::iter::once(present).chain(formers.cloned()).collect::<Vec<Tree>>()
+    });
+    state.store_trees(&trees);
 }
 
 /// What is known of the gateway before anything has happened.
@@ -251,17 +269,31 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
     let mut told_info = info(&plant.settings(), &plant.topics());
     let mut tell_at = Instant::now();
     let mut seen = None;
+    // For which settings, since which connection, and how often all was told.
+    let mut settled: Option<(Arc<Settings>, u64, u32)> = None;
     let mut has_stirred = true;
     loop {
         let now = Instant::now();
         let broker = plant.broker();
-        if broker.connected && plant.settings().home_assistant.discovery {
-            let store =
-                |outbox: &Outbox| outbox.announced().iter().for_each(|told| state.store_announced(told));
-            plant.mailbox().look(store);
+        if broker.connected {
+            let store = |outbox: &Outbox| {
+                let told = outbox.announced();
+                told.iter().for_each(|told| state.store_announced(told));
+                told.is_some()
+            };
+            let all_is_told = plant.mailbox().look(store);
+            // What was taken back may be lost with a connection: then it is taken back at the next start.
+            let settings = plant.settings();
+            let since = settled.take_if(|(of, ..)| Arc::ptr_eq(of, &settings));
+            let (connects, looks) = since.map_or((broker.connects, 0), |(_, connects, looks)| (connects, looks));
+            let looks = looks + u32::from(all_is_told && connects == broker.connects);
+            if looks == LOOKS_UNTIL_STORED {
+                remember_topics(&plant, &state, BTreeSet::new());
+            }
+            settled = Some((settings, connects, looks));
         }
-        let is_news = has_stirred || now >= tell_at || seen != Some(broker.client_id_taken);
-        seen = Some(broker.client_id_taken);
+        let is_news = has_stirred || now >= tell_at || seen != Some([broker.client_id_taken, broker.state_denied]);
+        seen = Some([broker.client_id_taken, broker.state_denied]);
         if !is_news && reporter.all_respond().await {
             shutdown::feed_watchdog();
             has_stirred = stirs(&plant, now, (now + ask_every).min(tell_at), pause).await;
@@ -328,6 +360,6 @@ async fn stirs(plant: &Plant, looked_at: Instant, next: Instant, pause: Duration
 fn states(report: &GatewayReport) -> Vec<bool> {
     let buses = report.buses.iter().flat_map(|bus| [bus.report.up, bus.report.paused, bus.responding]);
     let devices = report.devices().map(|(_, device)| device.online);
-    let of_broker = [report.broker.connected, report.broker.client_id_taken];
+    let of_broker = [report.broker.connected, report.broker.client_id_taken, report.broker.state_denied];
     buses.chain(devices).chain(of_broker).chain([report.configuration_error.is_some()]).collect()
 }

@@ -35,6 +35,10 @@ pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
     taken.set(flag(report.broker.client_id_taken));
     let help = "Whether another client with the same identifier takes this one's place again and again";
     registry.register("broker_client_id_taken", help, taken);
+    let denied = OneGauge::default();
+    denied.set(flag(report.broker.state_denied));
+    let help = "Whether others tell something else of this gateway's state again and again";
+    registry.register("broker_state_denied", help, denied);
     counter(&mut registry, "broker_connects", "Connections made", report.broker.connects);
     counter(&mut registry, "messages_dropped", "Messages that waited too long", report.broker.dropped);
 
@@ -305,6 +309,7 @@ mod tests {
         for line in [
             "busker_broker_connected 1.0",
             "busker_broker_client_id_taken 0.0",
+            "busker_broker_state_denied 0.0",
             "busker_bus_up{bus=\"cellar\"} 1.0",
             "busker_bus_load_ratio{bus=\"cellar\"} 0.25",
             "busker_bus_requests_total{bus=\"cellar\"} 12",

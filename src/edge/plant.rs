@@ -53,8 +53,11 @@ impl Parts {
     }
 }
 
-/// Everything that Home Assistant may know of this gateway.
+/// Everything that Home Assistant shall know of this gateway.
 pub fn identities(settings: &Settings, topics: &Topics) -> Vec<String> {
+    if !settings.home_assistant.discovery {
+        return Vec::new();
+    }
     let buses = settings.buses.iter().map(|bus| topics.bus_identity(&bus.name));
     let devices = settings.devices.iter().map(|device| topics.identity(&device.name));
     buses.chain(devices).chain([topics.bridge_identity()]).collect()

@@ -14,8 +14,10 @@ use std::thread::JoinHandle;
 use anyhow::{Context, bail};
 use rustix::fs::FlockOperation;
 use rustix::io::Errno;
+use serde::de::DeserializeOwned;
 
 use crate::engine::memory::{Memories, Memory, Record};
+use crate::engine::outbox::Tree;
 use crate::engine::time::Duration;
 
 /// What could not be stored is tried again after this.
@@ -23,6 +25,9 @@ const TRY_AGAIN_AFTER: Duration = Duration::from_secs(60);
 
 /// What Home Assistant has been told of this gateway, in `state_dir`.
 const ANNOUNCED: &str = "announced.json";
+
+/// On which topics something is told, and perhaps still has to be taken back.
+const TOPICS: &str = "topics.json";
 
 /// What was remembered at the start, and where to put what is to be remembered.
 pub struct StateFiles {
@@ -39,8 +44,11 @@ pub struct StateFiles {
     keeps: bool,
     /// What an earlier run has told Home Assistant, by topic, until somebody takes it.
     recalled: Mutex<BTreeMap<String, String>>,
-    /// The fingerprint of what is stored of that: the whole lies in the outbox already.
+    /// Below which base topics it has told something, until somebody takes it.
+    trees: Mutex<Vec<Tree>>,
+    /// The fingerprints of what is stored of both: the whole lies in the outbox already.
     announced: Mutex<u64>,
+    topics: Mutex<u64>,
     /// Held as long as this lives.
     _lock: Option<File>,
 }
@@ -55,7 +63,8 @@ struct Desk {
 #[derive(Default)]
 struct Waiting {
     memories: BTreeMap<String, Memory>,
-    announced: Option<String>,
+    /// By the file's name.
+    others: BTreeMap<&'static str, String>,
     finish: bool,
 }
 
@@ -77,7 +86,9 @@ impl StateFiles {
             thread: Mutex::default(),
             keeps: false,
             recalled: Mutex::default(),
+            trees: Mutex::default(),
             announced: Mutex::default(),
+            topics: Mutex::default(),
             _lock: lock,
         }
     }
@@ -112,8 +123,10 @@ impl StateFiles {
             // They may find room where a damaged memory must not be overwritten.
             return Ok(StateFiles::unkept(memories, Some(state_dir.join("recordings")), lock));
         }
-        let recalled = recall_announced(&state_dir.join(ANNOUNCED));
+        let recalled: BTreeMap<String, String> = recall_told(&state_dir.join(ANNOUNCED));
         let announced = fingerprint(recalled.iter().map(|(topic, payload)| (&**topic, &**payload)));
+        let trees: Vec<Tree> = recall_told(&state_dir.join(TOPICS));
+        let topics = fingerprint(topics_in(&trees));
         let desk = Arc::<Desk>::default();
         let (of_thread, of_files) = (desk.clone(), folder.clone());
         let thread = std::thread::Builder::new()
@@ -130,7 +143,9 @@ impl StateFiles {
             thread: Mutex::new(Some(thread)),
             keeps: true,
             recalled: Mutex::new(recalled),
+            trees: Mutex::new(trees),
             announced: Mutex::new(announced),
+            topics: Mutex::new(topics),
             _lock: lock,
         })
     }
@@ -187,16 +202,29 @@ impl StateFiles {
 
     /// Keeps what Home Assistant has been told, if it is not what is kept. Does not wait for that.
     pub fn store_announced(&self, told: &BTreeMap<&str, &str>) {
-        if !self.keeps {
-            return;
-        }
         let next = fingerprint(told.iter().map(|(topic, payload)| (*topic, *payload)));
-        if std::mem::replace(&mut *lock(&self.announced), next) == next {
-            return;
+        if self.keeps && std::mem::replace(&mut *lock(&self.announced), next) != next {
+            self.store_text(ANNOUNCED, serde_json::to_string(told));
         }
-        match serde_json::to_string(told) {
-            Ok(text) => self.desk.lock().announced = Some(text),
-            Err(error) => tracing::error!("what is announced cannot be stored: {error}"),
+    }
+
+    /// Where earlier runs have told something, the last one first; only once.
+    pub fn take_trees(&self) -> Vec<Tree> {
+        std::mem::take(&mut lock(&self.trees))
+    }
+
+    /// Keeps where something is told, or has to be taken back, if it is not what is kept. Does not wait for that.
+    pub fn store_trees(&self, trees: &[Tree]) {
+        let next = fingerprint(topics_in(trees));
+        if self.keeps && std::mem::replace(&mut *lock(&self.topics), next) != next {
+            self.store_text(TOPICS, serde_json::to_string(trees));
+        }
+    }
+
+    fn store_text(&self, name: &'static str, text: serde_json::Result<String>) {
+        match text {
+            Ok(text) => drop(self.desk.lock().others.insert(name, text)),
+            Err(error) => tracing::error!("`{name}` cannot be stored: {error}"),
         }
         self.desk.changed.notify_all();
     }
@@ -226,9 +254,9 @@ impl Desk {
     fn work(&self, folder: &Path) {
         let mut failed = false;
         loop {
-            let (memories, announced, finish) = self.take(failed);
-            if let Some(text) = announced {
-                let path = folder.with_file_name(ANNOUNCED);
+            let (memories, others, finish) = self.take(failed);
+            for (name, text) in others {
+                let path = folder.with_file_name(name);
                 if let Err(error) = replace(&path, &text) {
                     // The broker most likely remembers it too.
                     tracing::warn!("`{}` cannot be stored: {error}", path.display());
@@ -262,7 +290,7 @@ impl Desk {
     }
 
     /// Waits for something to store, or for the end. After a failure, what waits may wait.
-    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, Option<String>, bool) {
+    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, BTreeMap<&'static str, String>, bool) {
         let mut waiting = self.lock();
         if failed && !waiting.finish {
             let until_finish = |waiting: &mut Waiting| !waiting.finish;
@@ -270,11 +298,11 @@ impl Desk {
             waiting = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
         let nothing_to_do = |waiting: &mut Waiting| {
-            waiting.memories.is_empty() && waiting.announced.is_none() && !waiting.finish
+            waiting.memories.is_empty() && waiting.others.is_empty() && !waiting.finish
         };
         let mut waiting =
             self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
-        (std::mem::take(&mut waiting.memories), waiting.announced.take(), waiting.finish)
+        (std::mem::take(&mut waiting.memories), std::mem::take(&mut waiting.others), waiting.finish)
     }
 }
 
@@ -314,17 +342,21 @@ fn recall(path: &Path) -> Result<Option<Memory>, String> {
     }
 }
 
-/// What an earlier run has told Home Assistant; nothing if that is not known: the broker most likely does.
-fn recall_announced(path: &Path) -> BTreeMap<String, String> {
+/// What an earlier run has told; nothing if that is not known: the broker most likely does.
+fn recall_told<T: Default + DeserializeOwned>(path: &Path) -> T {
     let read = match fs::read_to_string(path) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return BTreeMap::new(),
+        Err(error) if error.kind() == ErrorKind::NotFound => return T::default(),
         Err(error) => Err(error.to_string()),
         Ok(text) => serde_json::from_str(&text).map_err(|error| error.to_string()),
     };
     read.unwrap_or_else(|reason| {
         tracing::warn!("`{}` cannot be used ({reason}) and will be written anew", path.display());
-        BTreeMap::new()
+        T::default()
     })
+}
+
+fn topics_in(trees: &[Tree]) -> impl Iterator<Item = (&str, &str)> {
+    trees.iter().flat_map(|tree| tree.topics.iter().map(|topic| (&*tree.base_topic, &**topic)))
 }
 
 fn fingerprint<'a>(announced: impl Iterator<Item = (&'a str, &'a str)>) -> u64 {
@@ -492,6 +524,22 @@ mod tests {
         assert!(!path.exists());
         fs::write(&path, "{\"a/config\": 7").expect("a file");
         assert_eq!(open().take_announced(), BTreeMap::new(), "a damaged one is as none");
+    }
+
+    #[test]
+    fn where_something_was_told_is_there_after_a_restart() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let open = || StateFiles::open(folder.path(), ["one"].into_iter()).expect("a thread");
+        let tree = |base: &str| Tree { base_topic: base.into(), topics: [format!("{base}/one/flow")].into() };
+        let files = open();
+        assert_eq!(files.take_trees(), []);
+        files.store_trees(&[tree("new"), tree("old")]);
+        drop(files);
+        let files = open();
+        assert_eq!(files.take_trees(), [tree("new"), tree("old")]);
+        files.store_trees(&[tree("new")]);
+        drop(files);
+        assert_eq!(open().take_trees(), [tree("new")]);
     }
 
     #[test]

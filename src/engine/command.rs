@@ -7,6 +7,8 @@
 
 mod wish;
 
+use serde::Serialize;
+
 pub use wish::Wish;
 
 use crate::engine::address::{Address, Span};
@@ -14,6 +16,7 @@ use crate::engine::codec;
 use crate::engine::device::{Device, Names, Point, PointIndex, Write, WriteFunction, WriteRule};
 use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
 use crate::engine::time::Duration;
+use crate::engine::transaction::Transaction;
 
 /// A command that has begun.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,7 +81,7 @@ pub struct Outcome {
     pub found: Option<String>,
     pub reason: Option<String>,
     /// As it came with the wish.
-    pub transaction: Option<serde_json::Value>,
+    pub transaction: Option<Transaction>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -130,16 +133,23 @@ impl Outcome {
 
     /// `{"outcome":"done","wanted":"ON","found":"ON","reason":null}`, and the `transaction` if one came.
     pub fn to_json(&self) -> String {
-        let mut json = serde_json::json!({
-            "outcome": self.kind.name(),
-            "wanted": self.wanted,
-            "found": self.found,
-            "reason": self.reason,
-        });
-        if let Some(transaction) = &self.transaction {
-            json["transaction"] = transaction.clone();
+        #[derive(Serialize)]
+        struct Told<'a> {
+            outcome: &'a str,
+            wanted: &'a str,
+            found: Option<&'a str>,
+            reason: Option<&'a str>,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            transaction: Option<&'a Transaction>,
         }
-        json.to_string()
+        let told = Told {
+            outcome: self.kind.name(),
+            wanted: &self.wanted,
+            found: self.found.as_deref(),
+            reason: self.reason.as_deref(),
+            transaction: self.transaction.as_ref(),
+        };
+        serde_json::to_string(&told).expect("texts are its only keys")
     }
 }
 

@@ -310,6 +310,8 @@ pub struct BrokerReport {
     pub connects: u64,
     /// Another client with the same identifier takes this gateway's place again and again.
     pub client_id_taken: bool,
+    /// Others tell something else of this gateway's state, again and again.
+    pub state_denied: bool,
     /// Messages that wait for it: at most one for each retained topic, and those told once.
     pub waiting: usize,
     /// Messages told once that were dropped since too many waited.
@@ -358,6 +360,7 @@ impl GatewayReport {
         if !self.broker.connected || self.buses.iter().any(|bus| bus.is_lost() || !bus.responding) {
             Status::Lost
         } else if self.broker.client_id_taken
+            || self.broker.state_denied
             || devices.any(|device| !device.online)
             || self.buses.iter().any(|bus| bus.report.paused)
         {

@@ -38,12 +38,13 @@ pub mod homeassistant;
 pub mod outbox;
 pub mod topics;
 
-// Obey: commands, settings, what outlives a restart, and the bus that ties all of it together.
+// Obey: commands with what they are known again by, settings, what outlives a restart, and the bus that ties all of it together.
 pub mod bus;
 pub mod command;
 pub mod memory;
 pub mod reload;
 pub mod request;
+pub mod transaction;
 pub mod upkeep;
 
 #[cfg(test)]

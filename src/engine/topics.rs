@@ -92,6 +92,11 @@ impl Topics {
         DeviceTopics { own }
     }
 
+    /// As it is configured.
+    pub fn base(&self) -> &str {
+        &self.base
+    }
+
     /// Retained; the last will.
     pub fn bridge_state(&self) -> String {
         format!("{}/bridge/state", self.base)
@@ -123,14 +128,16 @@ impl Topics {
         format!("{}/bridge/response/{verb}", self.base)
     }
 
-    /// The filters to subscribe to, so that everything [`Topics::parse`] knows arrives.
+    /// The filters to subscribe to, so that everything [`Topics::parse`] knows arrives, and the gateway's own state.
     pub fn subscriptions(&self) -> Vec<String> {
         let mut own = self.base.clone();
         for level in &self.layout.levels {
             own.push('/');
             own.push_str(if let Level::Fixed(text) = level { text } else { "+" });
         }
-        vec![format!("{own}/+/set"), format!("{own}/+/get"), format!("{}/bridge/request/+", self.base)]
+        let requests = format!("{}/bridge/request/+", self.base);
+        // Its own state too: others may have told it.
+        vec![format!("{own}/+/set"), format!("{own}/+/get"), requests, self.bridge_state()]
     }
 
     /// What a message on `topic` asks for; `None` if it is none of our business.

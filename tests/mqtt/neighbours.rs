@@ -89,6 +89,39 @@ fn a_client_identifier_that_is_taken_is_told_once_and_the_pauses_grow() {
 }
 
 #[test]
+fn a_state_that_somebody_else_has_told_is_put_right_at_once_but_not_without_end() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start(&broker, &configuration(&port));
+    super::wait_until_all_is_online(&watcher);
+    let state = "busker/bridge/state";
+    let last = |name: &str| super::payload(&remembered(&broker, name), state).to_string();
+    // The will of another gateway; a mistake; somebody who deletes it.
+    for payload in ["offline", "on", ""] {
+        watcher.forget();
+        watcher.publish_retained(state, payload);
+        watcher.wait_for(state, payload);
+        watcher.wait_for(state, "online");
+    }
+    assert_eq!(last("newcomer"), "online");
+    assert_eq!(health(&gateway)["broker"]["state_denied"], false);
+
+    watcher.forget();
+    for _ in 0..50 {
+        watcher.publish_retained(state, "offline");
+        watcher.publish("test/end", "");
+        watcher.wait_until("it has come", |got| got.topic == "test/end");
+    }
+    gateway.wait_for_log("somebody else tells `offline` on `busker/bridge/state` again and again");
+    watcher.wait_until("health", |got: &Received| {
+        got.topic == "busker/bridge/health" && json(&got.payload)["broker"]["state_denied"] == true
+    });
+    assert_eq!(health(&gateway)["status"], "degraded");
+    assert!(watcher.payloads(state).iter().filter(|payload| *payload == "online").count() <= 5);
+}
+
+#[test]
 fn a_second_gateway_with_the_same_state_dir_does_not_start() {
     let (broker, simulation) = (Broker::start(), simulation());
     let port = over_tcp(&simulation);

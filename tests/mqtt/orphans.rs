@@ -1,7 +1,7 @@
 //! What is taken out of the configuration while the gateway is off, and the broker forgets meanwhile: Home
 //! Assistant does not forget.
 
-use super::{json, over_tcp, simulation};
+use super::{json, over_tcp, remembered, simulation};
 use crate::support::{self, Broker, Gateway, Received, Watcher};
 
 const RELAYS: &str = "homeassistant/device/busker_relays/config";
@@ -112,4 +112,84 @@ fn what_a_point_a_device_or_another_layout_has_left_at_the_broker_is_forgotten_a
         panic!("of the old layout something is left: {:?}", kept("third"));
     });
     assert!(gateway.terminate().success());
+}
+
+/// Every retained topic below `base`, by a newcomer.
+fn below(broker: &Broker, name: &str, base: &str) -> Vec<String> {
+    let all = remembered(broker, name).into_iter().map(|got| got.topic);
+    all.filter(|topic| topic.starts_with(base)).collect()
+}
+
+#[test]
+fn what_a_gateway_told_below_another_base_topic_is_taken_back_at_the_next_start() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let text = |base: &str, more: &str| {
+        format!(
+            "mqtt: {{url: '{}', base_topic: {base}}}\n{more}buses: {{line: {{tcp: '{}'}}}}\ndevices:\n  \
+             board: {{bus: line, unit: 20, points: {{one: {{at: input 0, poll: fast}}}}}}\n",
+            broker.url(),
+            port.address()
+        )
+    };
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start_with(&text("busker", ""));
+    watcher.wait_for("busker/bridge/state", "online");
+    watcher.wait_for("busker/board/availability", "online");
+    let stored = gateway.state().join("announced.json");
+    let holds = |text: &str| std::fs::read_to_string(&stored).ok()?.contains(text).then_some(());
+    support::find(|| holds(BOARD)).expect("what is announced is remembered");
+    // What others tell below the old base topic and of devices that are called like ours stays.
+    let others = ["busker/board/note", "homeassistant/device/busker_board_2/config"];
+    others.iter().for_each(|topic| watcher.publish_retained(topic, "{}"));
+    others.iter().for_each(|topic| drop(watcher.wait_for(topic, "{}")));
+
+    watcher.forget();
+    let gateway = gateway.start_again(|| {}, &text("house", ""));
+    watcher.wait_for("house/bridge/state", "online");
+    watcher.wait_for(BOARD, "");
+    let left = || below(&broker, "left", "busker/");
+    support::find(|| (left() == ["busker/board/note"]).then_some(()))
+        .unwrap_or_else(|| panic!("below the old base topic is left: {:?}", left()));
+    let devices = below(&broker, "devices", "homeassistant/device/");
+    assert_eq!(devices.iter().filter(|topic| topic.contains("/busker_")).count(), 1, "{devices:?}");
+    assert!(devices.iter().any(|topic| topic.ends_with("/house_board/config")), "{devices:?}");
+
+    // Without discovery what was announced is taken back, too; and then what was told of a device.
+    let no_discovery = "home_assistant: {discovery: false}\n";
+    let gateway = gateway.start_again(|| {}, &text("house", no_discovery));
+    watcher.wait_for("homeassistant/device/house_board/config", "");
+    support::find(|| (below(&broker, "values", "house/board/").len() >= 3).then_some(())).expect("values");
+    let renamed = text("house", no_discovery).replace("board:", "desk:");
+    let gateway = gateway.start_again(|| {}, &renamed);
+    watcher.wait_for("house/desk/availability", "online");
+    support::find(|| below(&broker, "gone", "house/board/").is_empty().then_some(()))
+        .unwrap_or_else(|| panic!("left: {:?}", below(&broker, "left", "house/board/")));
+    assert!(below(&broker, "end", "homeassistant/device/house_").is_empty());
+    assert!(gateway.terminate().success());
+}
+
+#[test]
+fn what_stands_below_a_base_topic_that_somebody_else_has_now_is_left_alone() {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let text = |base: &str| {
+        format!("mqtt: {{url: '{}', base_topic: {base}}}\n{}", broker.url(), super::configuration(&port))
+    };
+    let watcher = Watcher::start(&broker, "watcher");
+    let first = Gateway::start_with(&text("busker"));
+    super::wait_until_all_is_online(&watcher);
+    let mut second = None;
+    let meanwhile = || {
+        watcher.wait_for("busker/bridge/state", "offline");
+        watcher.forget();
+        second = Some(Gateway::start_with(&text("busker")));
+        super::wait_until_all_is_online(&watcher);
+    };
+    let first = first.start_again(meanwhile, &text("house"));
+    first.wait_for_log("what this gateway told below `busker` before is not taken back");
+    watcher.wait_for("house/relays/availability", "online");
+    assert!(below(&broker, "newcomer", "busker/").len() > 60);
+    assert!(below(&broker, "devices", RELAYS) == [RELAYS]);
+    assert!(second.expect("it was started").terminate().success());
 }

@@ -45,6 +45,8 @@ pub(super) struct Feeder<Tell> {
     pub topics: Topics,
     pub status_topic: String,
     pub filters: Vec<String>,
+    /// Those of them where it is told whether somebody is below a base topic that this gateway had.
+    pub former_states: Vec<String>,
     pub mailbox: Arc<Mailbox>,
     pub state: Arc<Mutex<BrokerReport>>,
     pub connected: bool,
@@ -53,12 +55,14 @@ pub(super) struct Feeder<Tell> {
     /// What was last told of the connection.
     pub told_up: Option<bool>,
     pub subscribed: bool,
+    pub ending: bool,
+    /// Whether it was told that others tell something else of this gateway's state.
+    pub denied: bool,
     pub tell: Tell,
 }
 
 impl<Tell: Fn(News)> Feeder<Tell> {
     pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut goodbye: oneshot::Receiver<()>) {
-        let mut ending = false;
         loop {
             let wake_at = self.mailbox.outbox().wake_at();
             let until = wake_at.map_or(Duration::from_secs(3600), |time| self.clock.until(time));
@@ -69,16 +73,16 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 },
                 () = self.mailbox.news.notified() => {}
                 () = tokio::time::sleep(until) => self.mailbox.outbox().wake(self.clock.now()),
-                _ = &mut goodbye, if !ending => {
-                    ending = true;
+                _ = &mut goodbye, if !self.ending => {
+                    self.ending = true;
                     self.mailbox.outbox().goodbye();
                 }
             }
-            if ending && !self.connected {
+            if self.ending && !self.connected {
                 return;
             }
             let all_sent = self.feed();
-            if ending && all_sent {
+            if self.ending && all_sent {
                 return self.disconnect(events).await;
             }
         }
@@ -111,6 +115,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 state.reason = Some(reason);
                 drop(state);
                 self.connected = false;
+                self.mailbox.outbox().listens_no_more();
                 if self.told_up != Some(false) {
                     self.told_up = Some(false);
                     (self.tell)(News::Down);
@@ -131,16 +136,40 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.receive(&publish.topic, payload, publish.retain, stale);
             }
             Seen::Packet { packet: Packet::SubAck(answer), .. } => {
-                if answer.return_codes.contains(&SubscribeReasonCode::Failure) {
-                    tracing::warn!("the broker does not let this user subscribe; commands will not arrive");
+                let codes = answer.return_codes.iter().zip(&self.filters);
+                let refused = codes.filter(|(code, _)| **code == SubscribeReasonCode::Failure);
+                let refused: Vec<&str> = refused.map(|(_, filter)| filter.as_str()).collect();
+                if !refused.is_empty() {
+                    tracing::warn!(
+                        "the broker does not let this user subscribe to `{}`; what is told there, commands perhaps, \
+                         will not arrive",
+                        refused.join("`, `")
+                    );
                 }
+                self.mailbox.outbox().listens(self.clock.now());
             }
             Seen::Packet { .. } | Seen::Room => {}
         }
     }
 
     /// `stale` says why a command would be too old to be obeyed.
-    fn receive(&self, topic: &str, payload: String, retained: bool, stale: Option<String>) {
+    fn receive(&mut self, topic: &str, payload: String, retained: bool, stale: Option<String>) {
+        if topic == self.topics.bridge_state() {
+            // What the broker has kept is followed by this gateway's own word.
+            if !retained && !self.ending {
+                self.heard_state(&payload);
+            }
+            return;
+        }
+        if self.former_states.iter().any(|state| state == topic) {
+            let somebody = self.mailbox.outbox().heard_former(topic, &payload);
+            if let Some(base) = somebody {
+                tracing::warn!(
+                    "what this gateway told below `{base}` before is not taken back: somebody else is online there"
+                );
+            }
+            return;
+        }
         if topic == self.status_topic {
             // A retained birth message is old news: everything was sent when the connection was made.
             if payload == ONLINE && !retained {
@@ -175,6 +204,23 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             }
             Some(Incoming::Get { .. }) | None => {}
         }
+    }
+
+    fn heard_state(&mut self, payload: &str) {
+        let now = self.clock.now();
+        let mut outbox = self.mailbox.outbox();
+        outbox.heard_state(payload, now);
+        let is_denied = outbox.is_denied(now);
+        if is_denied && !self.denied {
+            tracing::warn!(
+                "somebody else tells `{}` on `{}` again and again, and is put right some times a minute: has another \
+                 gateway `base_topic: {}`?",
+                payload.chars().take(20).collect::<String>(),
+                self.topics.bridge_state(),
+                self.topics.base()
+            );
+        }
+        self.denied = is_denied;
     }
 
     /// Hands over as much as the library has room for; `true` if nothing is left.

@@ -21,6 +21,7 @@ use crate::edge::clock::Clock;
 use crate::edge::secrets::Secrets;
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
+use crate::engine::outbox::Outbox;
 use crate::engine::settings::{Mqtt, Settings};
 use crate::engine::time::Duration;
 use crate::engine::topics::{self, OFFLINE, Topics};
@@ -51,6 +52,7 @@ impl BrokerState {
         report.client_id_taken = lock(&self.connection).is_contested(self.clock.now());
         let outbox = self.mailbox.outbox();
         (report.waiting, report.dropped) = (outbox.waiting(), outbox.dropped());
+        report.state_denied = outbox.is_denied(self.clock.now());
         drop(outbox);
         report
     }
@@ -95,23 +97,28 @@ impl Broker {
         let poller = tokio::spawn(poller.run());
         let (goodbye, goodbye_heard) = oneshot::channel();
         let mut filters = topics.subscriptions();
+        let former_states = mailbox.look(Outbox::former_states);
+        filters.extend(former_states.iter().cloned());
         if settings.home_assistant.discovery {
             filters.push(settings.home_assistant.status_topic.clone());
-            // What an earlier run announced, to take away what is gone.
-            filters.push(topics::discovery(&settings.home_assistant.prefix, "+"));
         }
+        // What an earlier run announced, to take away what is gone; all of it without discovery.
+        filters.push(topics::discovery(&settings.home_assistant.prefix, "+"));
         let feeder = Feeder {
             client,
             clock,
             topics,
             status_topic: settings.home_assistant.status_topic.clone(),
             filters,
+            former_states,
             mailbox: mailbox.clone(),
             state: state.clone(),
             connected: false,
             contested: false,
             told_up: None,
             subscribed: false,
+            ending: false,
+            denied: false,
             tell,
         };
         let feeder = tokio::spawn(async move {

@@ -72,6 +72,12 @@ impl Bus {
             }
             return;
         }
+        if command.payload.is_empty() {
+            if let Some(reason) = self.devices[device].why_empty_is_no_value(target) {
+                let outcome = Outcome::new(OutcomeKind::Refused, "", reason);
+                return self.tell_outcome(device, target, outcome);
+            }
+        }
         let is_press = self.devices[device].is_press(target);
         let wish = Wish::parse(&command.payload);
         if is_press {

@@ -85,6 +85,8 @@ pub(super) struct DeviceState {
     /// A `get` or a command wants these told even if they have not changed.
     tell_anyway: Vec<PointIndex>,
     warned_of_retained: Vec<Target>,
+    /// Of which the broker holds a retained command, as far as this connection has told.
+    retained_at_the_broker: Vec<Target>,
     /// What each thing was last told to be, and when.
     told_things: Vec<Option<(String, Time)>>,
     beats: Beats,
@@ -159,6 +161,7 @@ impl DeviceState {
             announcement_due: true,
             tell_anyway: Vec::new(),
             warned_of_retained: Vec::new(),
+            retained_at_the_broker: Vec::new(),
             told_things: vec![None; settings.device.things.len()],
             beats: Beats::new(&settings.device),
             happened: BTreeMap::new(),

@@ -36,7 +36,9 @@ impl Inbox {
         let is_older = |other: &Event| match other {
             Event::Command(other) => {
                 let same = (&other.device, &other.point) == (&command.device, &command.point);
+                // An empty message is no value that would take the place of one.
                 same && other.retained == command.retained
+                    && other.payload.is_empty() == command.payload.is_empty()
             }
             _ => false,
         };

@@ -308,7 +308,10 @@ impl Bus {
             Event::Retire(device) => self.retire(&device),
             Event::Adopt(devices, memories) => self.adopt(devices, &memories),
             Event::Recorded(request, result) => self.recorded(request, result),
-            Event::BrokerUp => self.broker_up = true,
+            Event::BrokerUp => {
+                self.broker_up = true;
+                self.devices.iter_mut().for_each(DeviceState::forget_retained);
+            }
             Event::BrokerDown => self.broker_up = false,
             Event::Wake => self.make_way(),
             Event::Shutdown => self.stopping = true,

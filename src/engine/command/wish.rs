@@ -1,8 +1,10 @@
 //! What a message on a `set` topic wishes: a value, and perhaps a transaction that comes back with the outcome.
 
-use serde_json::Value as Json;
+use serde::Deserialize;
+use serde_json::value::RawValue;
 
 use super::{Outcome, OutcomeKind};
+use crate::engine::transaction::Transaction;
 
 /// More bytes than any wish has: the longest text fills 125 registers. What is longer is no value, and is not
 /// repeated in an outcome, which no broker would take.
@@ -14,7 +16,7 @@ pub struct Wish {
     /// As it was said.
     pub text: String,
     /// What its sender knows the outcome again by.
-    pub transaction: Option<Json>,
+    pub transaction: Option<Transaction>,
 }
 
 impl Wish {
@@ -35,20 +37,31 @@ impl Wish {
     }
 }
 
+/// As they stand in the payload: a value keeps its digits, too.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Enclosed<'p> {
+    #[serde(borrow)]
+    value: &'p RawValue,
+    #[serde(borrow)]
+    transaction: &'p RawValue,
+}
+
 fn enclosed(payload: &str) -> Option<Wish> {
     // Nearly no value begins so, and a slider sends a thousand.
     if payload.len() > BYTES_MAX || !payload.trim_start().starts_with('{') {
         return None;
     }
-    let Json::Object(mut object) = serde_json::from_str(payload).ok()? else { return None };
-    let (value, transaction) = (object.remove("value")?, object.remove("transaction")?);
-    let text = match value {
-        Json::String(text) => text,
-        Json::Number(number) => number.to_string(),
-        Json::Bool(on) => if on { "ON" } else { "OFF" }.to_string(),
-        Json::Null | Json::Array(_) | Json::Object(_) => return None,
+    let Enclosed { value, transaction } = serde_json::from_str(payload).ok()?;
+    let text = match value.get() {
+        "true" => "ON".to_string(),
+        "false" => "OFF".to_string(),
+        "null" => return None,
+        text if text.starts_with('"') => serde_json::from_str(text).ok()?,
+        several if several.starts_with(['[', '{']) => return None,
+        number => number.to_string(),
     };
-    object.is_empty().then_some(Wish { text, transaction: Some(transaction) })
+    Some(Wish { text, transaction: Some(Transaction::of(transaction)) })
 }
 
 impl From<String> for Wish {
@@ -68,9 +81,16 @@ mod tests {
             ("21.5", "21.5", None),
             ("", "", None),
             (r#"{"value": 21.5, "transaction": "x"}"#, "21.5", Some(r#""x""#)),
-            (r#"{"value": 1e-5, "transaction": 7}"#, "0.00001", Some("7")),
+            (r#"{"value": 1e-05, "transaction": 7}"#, "1e-05", Some("7")),
             (r#"{"value": 18446744073709551615, "transaction": 7}"#, "18446744073709551615", Some("7")),
-            (r#" {"transaction": {"a": [1]}, "value": "ON"}"#, "ON", Some(r#"{"a":[1]}"#)),
+            // Neither loses a digit, and nothing is put in order.
+            (
+                r#"{"value": 0.10000000000000000000001, "transaction": 123456789012345678901234567890.50}"#,
+                "0.10000000000000000000001",
+                Some("123456789012345678901234567890.50"),
+            ),
+            (r#"{"value": 1, "transaction": {"b": 1E+400, "a" :[ ]}}"#, "1", Some(r#"{"b": 1E+400, "a" :[ ]}"#)),
+            (r#" {"transaction": {"a":[1]}, "value": "ON"}"#, "ON", Some(r#"{"a":[1]}"#)),
             (r#"{"value": true, "transaction": null}"#, "ON", Some("null")),
             (r#"{"value": false, "transaction": ""}"#, "OFF", Some(r#""""#)),
             // To write such a text to a text point, it is put into another one.

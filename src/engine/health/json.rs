@@ -64,6 +64,7 @@ impl GatewayReport {
                 "reason": self.broker.reason,
                 "connects": self.broker.connects,
                 "client_id_taken": self.broker.client_id_taken,
+                "state_denied": self.broker.state_denied,
                 "waiting": self.broker.waiting,
                 "dropped": self.broker.dropped,
             },

@@ -10,8 +10,10 @@ impl Outbox {
     /// The broker remembers this announcement, perhaps of an earlier run. What it holds and we do not
     /// have any more is taken away properly; announcements that are not ours are left alone.
     pub fn found(&mut self, topic: &str, payload: &str) {
-        let Some(found) = Announcement::parse(&self.topics, topic, payload) else { return };
-        for topic in found.told_on() {
+        let Some(found) = Announcement::parse(&self.topics, topic, payload) else {
+            return self.found_of_former(topic, payload);
+        };
+        for topic in found.told_on().into_iter().filter(|topic| self.topics.are_above(topic)) {
             self.left_behind.insert(topic.to_string());
             // What stands beside it without being announced.
             if let Some(device) = DeviceTopics::with_availability_on(topic) {
@@ -32,7 +34,7 @@ impl Outbox {
     /// gone, or another layout. To be asked when everything has been told, for only then it is known.
     pub(super) fn next_left_behind(&mut self) -> Option<Message> {
         while let Some(topic) = self.left_behind.pop_first() {
-            if self.topics.are_above(&topic) && !self.is_told(&topic) {
+            if !self.is_told(&topic) {
                 return Some(Message::retained(topic, ""));
             }
         }

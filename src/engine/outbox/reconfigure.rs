@@ -48,10 +48,19 @@ impl Outbox {
         }
     }
 
+    /// All announcements that stand, by topic, told already or not.
+    pub fn told_announcements(&self) -> BTreeMap<String, String> {
+        let announced = self.retained.iter().filter(|(topic, _)| self.rank(topic) == Rank::Discovery);
+        announced.map(|(topic, entry)| (topic.to_string(), entry.payload.clone())).collect()
+    }
+
     /// What Home Assistant has been told of everything that this gateway has, by topic; `None` while it has not
     /// been told all of it yet. Worth remembering: a broker may forget it, and Home Assistant does not.
     pub fn announced(&self) -> Option<BTreeMap<&str, &str>> {
-        let is_told = self.queue.is_empty() && self.remembered.is_empty() && self.states_due_at.is_none();
+        let is_told = self.is_empty()
+            && self.formers.is_empty()
+            && self.remembered.is_empty()
+            && self.states_due_at.is_none();
         let own = self.own_devices.iter();
         let told = own.filter_map(|topic| {
             let entry = self.retained.get(topic.as_str())?;
@@ -62,7 +71,7 @@ impl Outbox {
 
     /// What an earlier run has announced, and the broker may have forgotten. What is there no more is announced
     /// once again and taken away then: Home Assistant lets go only of what it has been told since its start.
-    pub fn recall(&mut self, topic: &str, payload: &str) {
+    pub(super) fn recall_announcement(&mut self, topic: &str, payload: &str) {
         let is_gone = !self.own_devices.contains(topic);
         if let Some(found) = Announcement::parse(&self.topics, topic, payload).filter(|_| is_gone) {
             self.push_once(Message { retain: false, ..found.message() });
@@ -177,9 +186,9 @@ mod tests {
         let [boiler, pump] =
             ["boiler", "pump"].map(|device| format!("homeassistant/device/busker_{device}/config"));
         let mut outbox = Outbox::new(Topics::new("busker"), "homeassistant", ["busker_boiler".to_string()]);
-        outbox.recall(&boiler, &announcement(&["flow", "level"]));
-        outbox.recall(&pump, &announcement(&["speed"]));
-        outbox.recall("homeassistant/device/strange/config", "{}");
+        outbox.recall_announcement(&boiler, &announcement(&["flow", "level"]));
+        outbox.recall_announcement(&pump, &announcement(&["speed"]));
+        outbox.recall_announcement("homeassistant/device/strange/config", "{}");
         assert_eq!(outbox.announced(), None, "not all of it is told");
         let present = announcement(&["level"]);
         outbox.push(Message::retained(boiler.clone(), present.clone()));

@@ -145,11 +145,38 @@ impl DeviceState {
 
     /// Whether this is the first retained command seen for the target.
     pub(in crate::engine::bus) fn warn_of_retained(&mut self, target: Target) -> bool {
+        if !self.retained_at_the_broker.contains(&target) {
+            self.retained_at_the_broker.push(target);
+        }
         let first = !self.warned_of_retained.contains(&target);
         if first {
             self.warned_of_retained.push(target);
         }
         first
+    }
+
+    /// The connection is new: the broker tells again which retained commands it holds.
+    pub(in crate::engine::bus) fn forget_retained(&mut self) {
+        self.retained_at_the_broker.clear();
+    }
+
+    /// Why an empty message on a `set` topic is no value. It is what deletes a retained one, and who had
+    /// subscribed before cannot tell the one from the other: only a text may be meant to be empty.
+    pub(in crate::engine::bus) fn why_empty_is_no_value(&mut self, target: Target) -> Option<&'static str> {
+        let may_be_empty = match target {
+            Target::Thing(_) => false,
+            Target::Point(point) | Target::Setting(point) => {
+                // Of what is not known yet, the command finds out when it begins.
+                let resolved = codec::resolve(self.device(), point, self.known());
+                resolved.map_or(true, |resolved| resolved.form.kind.is_text())
+            }
+        };
+        if !may_be_empty {
+            return Some("an empty message is no value; it only deletes a retained one");
+        }
+        let at = self.retained_at_the_broker.iter().position(|other| *other == target)?;
+        self.retained_at_the_broker.swap_remove(at);
+        Some("an empty message deletes the retained one; sent once more, it is an empty text")
     }
 
     /// A write to `point` goes out: what it decides is unknown until it has been read back.

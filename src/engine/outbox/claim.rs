@@ -1,0 +1,146 @@
+//! What others tell of this gateway's own state, `offline` for example while it is online: another gateway's
+//! last will, or somebody's mistake. It is put right at once, but not for ever: who writes there again and again
+//! does so on purpose, and two gateways would never come to an end.
+
+use std::collections::VecDeque;
+
+use super::Outbox;
+use crate::engine::time::{Duration, Time};
+
+/// So often the state is put right in so long; after that when its time has come.
+pub(super) const CORRECTIONS: usize = 5;
+pub(super) const WITHIN: Duration = Duration::from_secs(60);
+
+#[derive(Clone, Debug, Default)]
+pub(super) struct Claim {
+    /// The last times that it was put right.
+    corrected: VecDeque<Time>,
+    /// It is to be put right then.
+    due: Option<Time>,
+}
+
+impl Claim {
+    /// Others say something else. Whether that is put right at once.
+    fn denied(&mut self, now: Time) -> bool {
+        if self.due.is_some() {
+            return false;
+        }
+        match self.corrected.front() {
+            Some(first) if self.is_full() && now < *first + WITHIN => {
+                self.due = Some(*first + WITHIN);
+                false
+            }
+            _ => {
+                self.corrected(now);
+                true
+            }
+        }
+    }
+
+    fn corrected(&mut self, now: Time) {
+        if self.is_full() {
+            self.corrected.pop_front();
+        }
+        self.corrected.push_back(now);
+        self.due = None;
+    }
+
+    fn is_full(&self) -> bool {
+        self.corrected.len() >= CORRECTIONS
+    }
+
+    pub(super) fn due(&self) -> Option<Time> {
+        self.due
+    }
+}
+
+impl Outbox {
+    /// Somebody has told the gateway's state, itself perhaps. What is not so is put right. Not to be told what the
+    /// broker kept from before this connection, since the state follows then anyway.
+    pub fn heard_state(&mut self, payload: &str, now: Time) {
+        let topic = self.topics.bridge_state();
+        let Some(entry) = self.retained.get(&*topic) else { return };
+        if *entry.payload == *payload {
+            self.claim.due = None;
+        } else if !entry.queued && self.claim.denied(now) {
+            self.tell_state_again();
+        }
+    }
+
+    /// Whether others tell something else of this gateway's state again and again.
+    pub fn is_denied(&self, now: Time) -> bool {
+        let claim = &self.claim;
+        claim.is_full() && claim.corrected.front().is_some_and(|first| now < *first + WITHIN)
+    }
+
+    /// The time of [`Claim::due`] may have come.
+    pub(super) fn wake_claim(&mut self, now: Time) {
+        if self.claim.due.is_some_and(|due| due <= now) {
+            self.claim.corrected(now);
+            self.tell_state_again();
+        }
+    }
+
+    fn tell_state_again(&mut self) {
+        let topic = self.topics.bridge_state();
+        if let Some(entry) = self.retained.get_mut(&*topic) {
+            if !std::mem::replace(&mut entry.queued, true) {
+                self.queue_last(super::Queued::Newest(topic.into()));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{check_sent, outbox, take_all};
+    use super::*;
+
+    const STATE: &str = "busker/bridge/state online";
+
+    fn at(millis: u64) -> Time {
+        Time::from_millis(100_000 + millis)
+    }
+
+    #[test]
+    fn what_others_say_of_our_state_is_put_right_and_what_we_say_is_not() {
+        let mut outbox = outbox();
+        outbox.heard_state("offline", at(0));
+        check_sent(&mut outbox, &[]);
+        outbox.connected();
+        // The state follows anyway.
+        outbox.heard_state("offline", at(0));
+        check_sent(&mut outbox, &[STATE]);
+        for payload in ["offline", "", "maybe"] {
+            outbox.heard_state(payload, at(1));
+            outbox.heard_state(payload, at(1));
+            check_sent(&mut outbox, &[STATE]);
+            outbox.heard_state("online", at(2));
+            check_sent(&mut outbox, &[]);
+        }
+    }
+
+    #[test]
+    fn a_quarrel_about_our_state_is_bounded_and_noticed() {
+        let mut outbox = outbox();
+        outbox.connected();
+        take_all(&mut outbox);
+        let mut told = 0;
+        for second in 0..600 {
+            let now = at(second * 1000);
+            outbox.wake(now);
+            outbox.heard_state("offline", now);
+            told += take_all(&mut outbox).len();
+            outbox.heard_state("online", now);
+            assert_eq!(outbox.is_denied(now), told >= CORRECTIONS, "after {second} s");
+        }
+        assert!((50..=CORRECTIONS * 11).contains(&told), "{told} times in ten minutes");
+        // The last word is ours, also when the other one has had one just after ours.
+        outbox.heard_state("offline", at(599_500));
+        let due = outbox.wake_at().expect("it is put right later");
+        outbox.wake(due);
+        check_sent(&mut outbox, &[STATE]);
+        assert!(!outbox.is_denied(due + WITHIN));
+        assert_eq!(outbox.wake_at(), None);
+    }
+}
