@@ -243,9 +243,12 @@ impl Bus {
         let bus = &settings.buses[index];
         let mut context = Context::new(settings, &bus.name);
         let tariff = Tariff::of(&bus.link, bus.gap);
-        let of_bus = settings.devices.iter().filter(|device| device.bus == index);
-        let mut devices: Vec<DeviceState> =
-            of_bus.map(|device| DeviceState::new(device.clone(), tariff, settings.eeprom)).collect();
+        let of_bus = || settings.devices.iter().filter(|device| device.bus == index);
+        let rests = tariff.idle_rests(&of_bus().map(|device| &*device.device).collect::<Vec<_>>());
+        let mut devices: Vec<DeviceState> = of_bus()
+            .zip(rests)
+            .map(|(device, rest)| DeviceState::new(device.clone(), tariff, rest, settings.eeprom))
+            .collect();
         let mut counters = Counters::default();
         for device in &mut devices {
             counters.persistent_writes += device.recall(memories);
