@@ -11,7 +11,7 @@ use super::{Failure, configuration};
 use crate::engine::device::Device;
 use crate::engine::plan::{self, Read, Tariff};
 use crate::engine::profile::Library;
-use crate::engine::settings::{Line, Link, Parity, Rs485};
+use crate::engine::settings::{DeviceSettings, Line, Link, Parity, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::Scalar;
 
@@ -84,7 +84,7 @@ fn of_profile(id: &str, turnaround: Duration) -> Result<DevicePlan, Failure> {
     let link = Link::Serial { path: String::new(), line, rs485: Rs485::Auto };
     let tariff = Tariff::of(&link, None);
     if id.ends_with(".yaml") {
-        return Ok(plan_of(id, &load_file(Path::new(id))?, tariff, turnaround));
+        return Ok(plan_of(id, &load_file(Path::new(id))?, tariff, turnaround, Duration::ZERO));
     }
     let library = Library::shipped();
     if !library.contains(id) {
@@ -94,7 +94,7 @@ fn of_profile(id: &str, turnaround: Duration) -> Result<DevicePlan, Failure> {
         )));
     }
     let device = library.load(id).map_err(configuration::faults)?;
-    Ok(plan_of(id, &device, tariff, turnaround))
+    Ok(plan_of(id, &device, tariff, turnaround, Duration::ZERO))
 }
 
 fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
@@ -113,13 +113,26 @@ fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
         .into_iter()
         .map(|device| {
             let bus = &settings.buses[device.bus];
-            plan_of(&device.name, &device.device, Tariff::of(&bus.link, bus.gap), args.turnaround)
+            let tariff = Tariff::of(&bus.link, bus.gap);
+            let on_bus: Vec<&DeviceSettings> =
+                settings.devices.iter().filter(|other| other.bus == device.bus).collect();
+            let rests = tariff.idle_rests(&on_bus.iter().map(|other| &*other.device).collect::<Vec<_>>());
+            let of_device = on_bus.iter().zip(rests).find(|(other, _)| other.name == device.name);
+            let idle_rest = of_device.map_or(Duration::ZERO, |(_, rest)| rest);
+            plan_of(&device.name, &device.device, tariff, args.turnaround, idle_rest)
         })
         .collect())
 }
 
-fn plan_of(name: &str, device: &Device, tariff: Tariff, turnaround: Duration) -> DevicePlan {
-    let reads = plan::plan(device, tariff.cost(plan::planned_with(turnaround)), &[]);
+/// `idle_rest`: [`Tariff::idle_rests`].
+fn plan_of(
+    name: &str,
+    device: &Device,
+    tariff: Tariff,
+    turnaround: Duration,
+    idle_rest: Duration,
+) -> DevicePlan {
+    let reads = plan::plan(device, tariff.cost(plan::planned_with(turnaround) + idle_rest), &[]);
     let cost = tariff.cost(turnaround);
     let row = |read: &Read| ReadRow {
         poll: read.poll.name(),

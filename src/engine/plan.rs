@@ -102,6 +102,38 @@ impl Tariff {
     pub fn cost(self, turnaround: Duration) -> Cost {
         Cost { request: self.request + turnaround.as_nanos() as u64, byte: self.byte }
     }
+
+    /// Of the silence that each of these devices wants before it is asked again (`delay`), the part that nobody
+    /// else on their bus makes use of: it is lost with each request, as if the device took that much longer to
+    /// answer. A device that has the line for itself loses all of it, one among others that keep the line
+    /// busy none.
+    pub fn idle_rests(self, devices: &[&Device]) -> Vec<Duration> {
+        let rest = |device: &Device| device.wire.limits.delay;
+        if devices.iter().all(|device| rest(device).is_zero()) {
+            return vec![Duration::ZERO; devices.len()];
+        }
+        let cost = self.cost(USUAL_TURNAROUND);
+        let loads: Vec<f64> = devices.iter().map(|device| load(device, cost)).collect();
+        let idle = |own: usize| {
+            let others = loads.iter().enumerate().filter(|(other, _)| *other != own).map(|(_, load)| load);
+            (1.0 - others.sum::<f64>()).max(0.0)
+        };
+        devices.iter().enumerate().map(|(own, device)| rest(device).mul_f64(idle(own))).collect()
+    }
+}
+
+/// Seconds of wire that the polls of a device want in a second.
+fn load(device: &Device, cost: Cost) -> f64 {
+    let intervals = &device.wire.intervals;
+    let of_read = |read: &Read| {
+        let period = match read.poll {
+            Poll::Fast => intervals.fast,
+            Poll::Slow => intervals.slow,
+            Poll::Once | Poll::Never => return 0.0,
+        };
+        cost.time_of(read.span).as_secs_f64() / period.as_secs_f64().max(1e-6)
+    };
+    plan(device, cost, &[]).iter().map(of_read).sum()
 }
 
 /// What a read of one device costs, in nanoseconds.

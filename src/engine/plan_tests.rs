@@ -47,6 +47,26 @@ fn near_points_share_a_read_and_far_ones_do_not() {
 }
 
 #[test]
+fn the_silence_that_a_device_wants_counts_as_far_as_nobody_else_is_asked_meanwhile() {
+    let slow = device(&[(0, 1), (40, 1)], |wire| wire.limits.delay = Duration::from_millis(100));
+    let often = |millis| device(&[(0, 20)], |wire| wire.intervals.fast = Duration::from_millis(millis));
+    let tariff = Tariff::of_line(LINE, LINE.frame_gap());
+    // A read of twenty registers takes some 37 ms.
+    for (what, others, expected, reads) in [
+        ("alone", vec![], 100, 1),
+        ("hardly anything else", vec![often(1000)], 96, 1),
+        ("half of the line", vec![often(150), often(150)], 50, 1),
+        ("hardly any time", vec![often(80), often(80)], 6, 2),
+        ("none", vec![often(1)], 0, 2),
+    ] {
+        let on_bus: Vec<&Device> = std::iter::once(&slow).chain(&others).collect();
+        let rest = tariff.idle_rests(&on_bus)[0];
+        assert_eq!(rest.as_millis(), expected, "{what}");
+        assert_eq!(plan(&slow, tariff.cost(USUAL_TURNAROUND + rest), &[]).len(), reads, "{what}");
+    }
+}
+
+#[test]
 fn a_read_sleeps_while_none_of_its_points_lives() {
     let mut device = device(&[(0, 1), (200, 1), (201, 1), (400, 1), (401, 1)], |_| {});
     for living in [2, 3, 4] {
@@ -160,13 +180,13 @@ fn may_be_one_read(device: &Device, read: &Read, refused: &[Span]) -> bool {
 }
 
 /// Every way to share the points out among reads; the cost of the cheapest that keeps the rules.
-fn brute_force(device: &Device, refused: &[Span]) -> u64 {
+fn brute_force(device: &Device, cost: Cost, refused: &[Span]) -> u64 {
     let mut points: Vec<(PointIndex, Address)> =
         device.points.iter().enumerate().map(|(index, point)| (index, point.at)).collect();
     points.sort_by_key(|(index, address)| (address.span, address.bits, *index));
     let cost_of = |read: &Vec<(PointIndex, Address)>| {
         let read = read_of(Poll::Fast, read);
-        (read.points.len() == 1 || may_be_one_read(device, &read, refused)).then(|| cost().of_read(read.span))
+        (read.points.len() == 1 || may_be_one_read(device, &read, refused)).then(|| cost.of_read(read.span))
     };
     let mut shared_out = vec![Vec::new()];
     for point in points {
@@ -196,6 +216,9 @@ proptest! {
         gap in prop::option::of(0u16..12),
         forbidden in prop::option::of((0u16..60, 0u16..4)),
         refused in prop::option::of((0u16..60, 0u16..4)),
+        turnaround in 0u64..80,
+        delay in prop_oneof![Just(0u64), 1u64..100],
+        others in 0usize..4,
     ) {
         let at = |(first, more): (u16, u16)| span(RegisterTable::Input, first, first + more);
         // Two values never share a register.
@@ -206,6 +229,7 @@ proptest! {
         let device = device(&places, |wire| {
             wire.limits.read_registers = limit;
             wire.limits.gap = gap;
+            wire.limits.delay = Duration::from_millis(delay);
             // The profile's check refuses points inside a forbidden span, so only what is free is forbidden.
             wire.forbidden = forbidden.map(at).into_iter()
                 .filter(|span| !places.iter().any(|(first, count)| {
@@ -214,8 +238,15 @@ proptest! {
                 .map(|span| Forbidden { span, reason: String::new() }).collect();
         });
         let refused: Vec<Span> = refused.map(at).into_iter().collect();
-        let reads = plan(&device, cost(), &refused);
-        prop_assert_eq!(total(&reads, cost()), brute_force(&device, &refused));
+        // On a line with others that are asked meanwhile a pause costs less.
+        let other = self::device(&[(0, 10)], |_| {});
+        let on_bus: Vec<&Device> = std::iter::once(&device).chain(std::iter::repeat_n(&other, others)).collect();
+        let tariff = Tariff::of_line(LINE, LINE.frame_gap());
+        let idle_rest = tariff.idle_rests(&on_bus)[0];
+        prop_assert_eq!(idle_rest == device.wire.limits.delay, others == 0 || delay == 0);
+        let cost = tariff.cost(Duration::from_millis(turnaround) + idle_rest);
+        let reads = plan(&device, cost, &refused);
+        prop_assert_eq!(total(&reads, cost), brute_force(&device, cost, &refused));
         let mut read_points: Vec<PointIndex> =
             reads.iter().flat_map(|read| read.points.iter().map(|(point, _)| *point)).collect();
         read_points.sort_unstable();

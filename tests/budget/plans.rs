@@ -126,3 +126,28 @@ fn while_a_register_is_refused_it_gets_no_new_neighbours() {
     assert_eq!(wire.published["busker/meter/far"], "None");
     assert_eq!(wire.published["busker/meter/near"], "0", "it has not been taken along");
 }
+
+#[test]
+fn where_a_device_wants_silence_reading_over_a_gap_pays_sooner_unless_others_need_the_line() {
+    for (others, expected) in [(0, vec![(0, 40)]), (6, vec![(0, 0), (40, 40)])] {
+        let mut configuration = String::from(
+            "buses:\n  line: {serial: /dev/serial/by-id/usb-A, baud: 19200, parity: even}\ndevices:\n  \
+             slow: {bus: line, unit: 1, poll: {fast: 400ms}, points: {near: {at: holding 0, poll: fast}, \
+             far: {at: holding 40, poll: fast}}, wire: {limits: {delay: 100ms}}}\n",
+        );
+        for unit in 2..others + 2 {
+            configuration += &format!(
+                "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: 100ms}}, points: {{p: {{at: holding 0, \
+                 poll: fast}}}}}}\n"
+            );
+        }
+        let mut wire = Wire::new(&configuration, Duration::from_millis(5));
+        wire.run_until(Time::from_millis(20_000));
+        let of_slow = wire.ever.iter().filter(|asked| asked.unit == 1);
+        let mut reads: Vec<(u16, u16)> =
+            of_slow.map(|asked| (asked.address, asked.address + asked.argument - 1)).collect();
+        reads.sort_unstable();
+        reads.dedup();
+        assert_eq!(reads, expected, "with {others} others");
+    }
+}

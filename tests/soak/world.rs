@@ -1,11 +1,13 @@
 //! A bus, its guard and a line of simulated devices, joined without threads, ports and clocks: an hour
 //! passes as fast as it can be calculated.
 
+use std::collections::BTreeMap;
+
 use busker::engine::bus::{Action, Bus, Event};
 use busker::engine::memory::Memories;
-use busker::engine::modbus::Reply;
 use busker::engine::modbus::guard::Guard;
-use busker::engine::settings::Settings;
+use busker::engine::modbus::{Reply, RequestError};
+use busker::engine::settings::{Link, Settings};
 use busker::engine::time::{Duration, Time};
 use busker::engine::topics::Message;
 use busker::simulator::Framing;
@@ -16,6 +18,7 @@ use busker::simulator::wire::{Receiver, character_time};
 pub struct World {
     pub now: Time,
     pub line: Line,
+    framing: Framing,
     settings: Settings,
     bus: Bus,
     guard: Guard,
@@ -52,15 +55,22 @@ fn spoil(bytes: &mut [u8]) {
 
 enum Port {
     Open,
+    /// Nobody has asked for it.
+    Closed,
     OpensAt(Time),
 }
 
 impl World {
     pub fn new(settings: Settings, line: Line) -> World {
         let now = Time(0);
+        let framing = match &settings.buses[0].link {
+            Link::Tcp { .. } => Framing::Tcp,
+            Link::Serial { .. } | Link::RtuOverTcp { .. } => Framing::Rtu,
+        };
         World {
             now,
-            receiver: Receiver::new(Framing::Rtu, line.settings()),
+            receiver: Receiver::new(framing, line.settings()),
+            framing,
             line,
             bus: Bus::new(now, &settings, 0, &Memories::default()),
             guard: Guard::new(&settings.buses[0].link, None),
@@ -139,7 +149,7 @@ impl World {
     fn next_time(&self) -> Time {
         let port = match self.port {
             Port::OpensAt(at) => Some(at),
-            Port::Open => None,
+            Port::Open | Port::Closed => None,
         };
         let send = self.to_send.map(|not_before| not_before.max(self.guard.earliest_send(self.now)));
         let coming = self.coming.iter().map(|(_, transmission)| transmission.at).min();
@@ -152,18 +162,7 @@ impl World {
     /// Does what is due, in the order of the program's own loop.
     fn step(&mut self) {
         let now = self.now;
-        if let Some(received) = self.receiver.next(now) {
-            for mut answer in self.line.hear(now, Framing::Rtu, &received) {
-                // A device that is late does one thing after the other: nothing overtakes.
-                let unit = usize::from(self.asked);
-                answer.at = answer.at.max(self.answered_at[unit] + Duration::from_millis(1));
-                self.answered_at[unit] = answer.at;
-                if self.meets_another(Some(self.asked), answer.at, answer.bytes.len()) {
-                    spoil(&mut answer.bytes);
-                }
-                self.coming.push((Some(self.asked), answer));
-            }
-        }
+        self.listen();
         if matches!(self.port, Port::OpensAt(at) if at <= now) {
             self.port = Port::Open;
             self.tell(Event::LinkUp);
@@ -183,15 +182,18 @@ impl World {
                 self.to_send = None;
                 let mut heard = self.guard.frame().to_vec();
                 let over_at = now + character_time(self.line.settings()) * heard.len() as u32;
-                if self.meets_another(None, over_at, heard.len()) {
+                if self.framing == Framing::Rtu && self.meets_another(None, over_at, heard.len()) {
                     spoil(&mut heard);
                 }
                 self.receiver.push(now, &heard);
-                self.asked = self.guard.frame()[0];
+                self.asked = self.guard.frame()[if self.framing == Framing::Rtu { 0 } else { 6 }];
                 self.asked_at[usize::from(self.asked)] = now;
                 let frame = format!("{now} -> {:02X?}", self.guard.frame());
                 self.frames.push((now, self.asked, frame));
                 self.guard.sent(now);
+                if self.framing == Framing::Tcp {
+                    self.listen();
+                }
             }
             Some(_) => {}
             None if self.guard.wake_at().is_some_and(|at| at <= now) => {
@@ -202,6 +204,55 @@ impl World {
         }
         if self.bus.wake_at().is_some_and(|at| at <= now) {
             self.tell(Event::Wake);
+        }
+    }
+
+    /// Hands the devices the request that has come whole.
+    fn listen(&mut self) {
+        if let Some(received) = self.receiver.next(self.now) {
+            let answers = self.line.hear(self.now, self.framing, &received);
+            self.owe(answers);
+        }
+    }
+
+    /// The unit that was asked sends this.
+    fn owe(&mut self, mut answers: Vec<Transmission>) {
+        // A device that is late does one thing after the other: nothing overtakes.
+        let unit = usize::from(self.asked);
+        for answer in &mut answers {
+            answer.at = answer.at.max(self.answered_at[unit] + Duration::from_millis(1));
+            self.answered_at[unit] = answer.at;
+        }
+        match self.framing {
+            Framing::Rtu => {
+                for answer in &mut answers {
+                    if self.meets_another(Some(self.asked), answer.at, answer.bytes.len()) {
+                        spoil(&mut answer.bytes);
+                    }
+                }
+            }
+            Framing::Tcp => self.put_behind_others(&mut answers),
+        }
+        self.coming.extend(answers.into_iter().map(|answer| (Some(self.asked), answer)));
+    }
+
+    /// In a stream a frame that comes in pieces has no other one between them.
+    fn put_behind_others(&mut self, answers: &mut [Transmission]) {
+        while let (Some(first), Some(last)) = (answers.first(), answers.last()) {
+            let (begin, end) = (first.at, last.at);
+            let of_others = self.coming.iter().filter(|(sender, _)| *sender != Some(self.asked));
+            let mut others: BTreeMap<Option<u8>, (Time, Time)> = BTreeMap::new();
+            for (sender, coming) in of_others {
+                let (from, to) = others.entry(*sender).or_insert((coming.at, coming.at));
+                (*from, *to) = ((*from).min(coming.at), (*to).max(coming.at));
+            }
+            let Some((_, until)) = others.into_values().find(|(from, to)| *from <= end && begin <= *to)
+            else {
+                return;
+            };
+            let later = until + Duration::from_micros(1) - begin;
+            answers.iter_mut().for_each(|answer| answer.at += later);
+            self.answered_at[usize::from(self.asked)] = end + later;
         }
     }
 
@@ -225,7 +276,20 @@ impl World {
 
     fn answered(&mut self, reply: Option<Reply>) {
         if let Some(reply) = reply {
-            self.tell(Event::Reply(reply));
+            self.hand_over(reply);
+            self.perform();
+        }
+    }
+
+    fn hand_over(&mut self, reply: Reply) {
+        match reply.result {
+            // No reply but the link's end.
+            Err(RequestError::Link(reason)) => {
+                self.close(self.now);
+                self.port = Port::Closed;
+                self.bus.handle(self.now, Event::LinkDown(reason));
+            }
+            _ => self.bus.handle(self.now, Event::Reply(reply)),
         }
     }
 
@@ -237,7 +301,7 @@ impl World {
                 }
                 Action::Send { request, not_before, timeout } => {
                     match self.guard.begin(self.now, &request, timeout) {
-                        Some(reply) => self.bus.handle(self.now, Event::Reply(reply)),
+                        Some(reply) => self.hand_over(reply),
                         None => self.to_send = Some(not_before),
                     }
                 }

@@ -272,7 +272,10 @@ impl Player {
                     let saved = Saved { path: "FILE".into(), frames, why: recording.why };
                     self.bus.handle(self.now, Event::Recorded(request, Ok(saved)));
                 }
-                Action::Reopen { after } => self.write(&format!("reopen after {} ms", after.as_millis())),
+                Action::Reopen { after } => {
+                    let wrong = if self.in_flight.is_some() { "WRONG, under a request: " } else { "" };
+                    self.write(&format!("{wrong}reopen after {} ms", after.as_millis()));
+                }
                 Action::Say(severity, text) => {
                     let mark = if severity == Severity::Warning { "warn" } else { "say" };
                     self.write(&format!("{mark} {text}"));

@@ -53,6 +53,8 @@ enum Happening {
     Changed(usize),
     LinkDown,
     LinkUp,
+    /// So many requests, one after the other, get no answer, while commands come.
+    Mute(u8),
     Time(u16),
 }
 
@@ -78,6 +80,7 @@ fn happening() -> impl Strategy<Value = Happening> {
         1 => (0usize..5).prop_map(Happening::Changed),
         1 => Just(Happening::LinkDown),
         2 => Just(Happening::LinkUp),
+        1 => (1u8..12).prop_map(Happening::Mute),
         4 => (0u16..2000).prop_map(Happening::Time),
     ]
 }
@@ -129,6 +132,7 @@ impl Observed {
                     self.in_flight = None;
                     self.bus.handle(self.now, Event::Withdrawn);
                 }
+                Action::Reopen { .. } => assert!(self.in_flight.is_none(), "a link ends under a request"),
                 Action::Publish(message) if message.topic.ends_with("/outcome") => self.outcomes += 1,
                 Action::Publish(message) if message.topic.contains("/response/") => {
                     self.responses += usize::from(!message.payload.contains(r#""status":"progress""#));
@@ -209,6 +213,14 @@ impl Observed {
                     self.handle(Event::LinkUp);
                 }
             }
+            Happening::Mute(count) => {
+                for number in 0..*count {
+                    self.end(&End::Silence);
+                    self.play(&Happening::Command(usize::from(number) % COMMANDS.len()));
+                    self.play(&Happening::LinkUp);
+                    self.play(&Happening::Time(500));
+                }
+            }
             Happening::Time(millis) => {
                 let until = self.now + Duration::from_millis(u64::from(*millis));
                 while let Some(wake_at) = self.bus.wake_at().filter(|wake_at| *wake_at <= until) {
@@ -237,9 +249,10 @@ proptest! {
 
     #[test]
     fn each_command_and_each_request_has_one_answer_and_one_question_is_in_flight(
+        link in prop_oneof![Just(""), Just("tcp\n")],
         happenings in prop::collection::vec(happening(), 1..300),
     ) {
-        let settings = devices::settings(DEVICES);
+        let settings = devices::settings(&format!("{link}{DEVICES}"));
         let mut observed = Observed {
             bus: Bus::new(Time::default(), &settings, 0, &Memories::default()),
             now: Time::default(),

@@ -40,11 +40,12 @@ impl Budget {
         let planned_with = plan::planned_with(turnaround);
         let (mut reads, mut wants) = (Vec::new(), Vec::new());
         let mut longest_timeout = bus.response_timeout;
-        for (device, settings) in devices.iter().enumerate() {
+        let rests = tariff.idle_rests(&devices.iter().map(|device| &*device.device).collect::<Vec<_>>());
+        for (device, (settings, idle_rest)) in devices.iter().zip(rests).enumerate() {
             let wire = &settings.device.wire;
             longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
             wants.push(Wants::of(settings, tariff.cost(turnaround)));
-            for read in plan(&settings.device, tariff.cost(planned_with), &[]) {
+            for read in plan(&settings.device, tariff.cost(planned_with + idle_rest), &[]) {
                 let time = tariff.cost(turnaround).time_of(read.span);
                 let rest = wire.limits.delay;
                 let period = match read.poll {

@@ -1,6 +1,7 @@
 //! Devices leave a running bus and come to it, while the others go on as if nothing had happened.
 
 use crate::engine::command::OutcomeKind;
+use crate::engine::device::Device;
 use crate::engine::memory::Memories;
 use crate::engine::plan::Tariff;
 use crate::engine::settings::DeviceSettings;
@@ -88,8 +89,13 @@ impl Bus {
     /// These devices come, as at the start of the bus.
     pub(super) fn adopt(&mut self, devices: Vec<DeviceSettings>, memories: &Memories) {
         let tariff = Tariff::of(&self.link, self.gap);
-        for settings in devices {
-            let mut device = DeviceState::new(settings, tariff, self.eeprom);
+        let staying = self.devices.iter().map(DeviceState::device);
+        let all: Vec<&Device> = staying.chain(devices.iter().map(|device| &*device.device)).collect();
+        let mut rests = tariff.idle_rests(&all).into_iter();
+        // Of those that stay it counts when they are planned anew for another reason.
+        self.devices.iter_mut().zip(rests.by_ref()).for_each(|(device, rest)| device.idle_rest = rest);
+        for (settings, rest) in devices.into_iter().zip(rests) {
+            let mut device = DeviceState::new(settings, tariff, rest, self.eeprom);
             self.counters.persistent_writes += device.recall(memories);
             device.introduce(self.now, &mut self.context);
             if self.link_state == LinkState::Up {

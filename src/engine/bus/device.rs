@@ -51,6 +51,8 @@ const SLOW_PERHAPS: Duration = Duration::from_secs(30);
 pub(super) struct DeviceState {
     settings: DeviceSettings,
     tariff: Tariff,
+    /// What is lost with each request of the silence that it wants.
+    pub(super) idle_rest: Duration,
     turnaround: Turnaround,
     values: Values,
     polls: Polls,
@@ -127,13 +129,19 @@ impl Turn {
 }
 
 impl DeviceState {
-    pub(super) fn new(settings: DeviceSettings, tariff: Tariff, eeprom: Eeprom) -> DeviceState {
+    pub(super) fn new(
+        settings: DeviceSettings,
+        tariff: Tariff,
+        idle_rest: Duration,
+        eeprom: Eeprom,
+    ) -> DeviceState {
         let values = Values::new(&settings.device);
         let turnaround = Turnaround::default();
-        let reads = plan::plan(&settings.device, tariff.cost(turnaround.planned_with()), &[]);
+        let reads = plan::plan(&settings.device, tariff.cost(turnaround.planned_with() + idle_rest), &[]);
         let polls = Polls::new(reads, settings.device.wire.intervals, |point| values.is_selector(point));
         DeviceState {
             tariff,
+            idle_rest,
             turnaround,
             values,
             polls,
@@ -172,7 +180,7 @@ impl DeviceState {
 
     /// The cheapest reads, as far as it is known what they cost and what the device refuses.
     fn plan(&self) -> Vec<Read> {
-        let cost = self.tariff.cost(self.turnaround.planned_with());
+        let cost = self.tariff.cost(self.turnaround.planned_with() + self.idle_rest);
         plan::plan(&self.settings.device, cost, &self.refused)
     }
 

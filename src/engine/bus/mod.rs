@@ -243,9 +243,12 @@ impl Bus {
         let bus = &settings.buses[index];
         let mut context = Context::new(settings, &bus.name);
         let tariff = Tariff::of(&bus.link, bus.gap);
-        let of_bus = settings.devices.iter().filter(|device| device.bus == index);
-        let mut devices: Vec<DeviceState> =
-            of_bus.map(|device| DeviceState::new(device.clone(), tariff, settings.eeprom)).collect();
+        let of_bus = || settings.devices.iter().filter(|device| device.bus == index);
+        let rests = tariff.idle_rests(&of_bus().map(|device| &*device.device).collect::<Vec<_>>());
+        let mut devices: Vec<DeviceState> = of_bus()
+            .zip(rests)
+            .map(|(device, rest)| DeviceState::new(device.clone(), tariff, rest, settings.eeprom))
+            .collect();
         let mut counters = Counters::default();
         for device in &mut devices {
             counters.persistent_writes += device.recall(memories);
@@ -439,12 +442,13 @@ impl Bus {
         self.look_for_signs(in_flight.device, &reply);
         let rests_until = in_flight.device.zip(self.rests_until(&reply));
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
+        // Before anything more is asked on it.
         self.renew_used_connection();
+        self.renew_silent_connection();
         self.request_ended(in_flight, reply.result);
         if let Some((device, until)) = rests_until {
             self.devices[device].rest_until(until);
         }
-        self.renew_silent_connection();
     }
 
     fn request_ended(&mut self, in_flight: InFlight, result: Result<Answer, RequestError>) {

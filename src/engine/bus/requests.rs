@@ -218,8 +218,7 @@ impl Bus {
             if let Flow::Write(write) = &running.flow {
                 let points = write.points().to_vec();
                 self.counters.writes += 1;
-                self.counters.persistent_writes +=
-                    self.devices[device].about_to_write_raw(self.now, &points, &mut self.context);
+                self.devices[device].about_to_write_raw(self.now, &points, &mut self.context);
             }
         }
         self.requests.asked = true;
@@ -231,6 +230,7 @@ impl Bus {
     pub(super) fn request_answered(&mut self, sent_at: Time, result: Result<Answer, RequestError>) {
         let Some(Running { request, device, mut flow, .. }) = self.requests.running.take() else { return };
         let state = &mut self.devices[device];
+        self.counters.persistent_writes += state.has_written(&result, &mut self.context);
         if flow.wants_presence() {
             match &result {
                 Ok(_) | Err(RequestError::Exception(_) | RequestError::Impossible(_)) => {}

@@ -3,6 +3,7 @@
 use crate::engine::codec;
 use crate::engine::command::{Outcome, OutcomeKind};
 use crate::engine::device::PointIndex;
+use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::plan::Read;
 use crate::engine::time::Time;
 
@@ -188,8 +189,6 @@ impl DeviceState {
     ) {
         self.counters.writes += 1;
         if self.details(point).persistent {
-            self.counters.persistent_writes += 1;
-            self.keeping.has_changed(context);
             self.wear.spend(now, point);
         }
         if self.values.is_selector(point) {
@@ -197,6 +196,23 @@ impl DeviceState {
             self.wake_reads();
             self.tell_all(now, context);
         }
+    }
+
+    /// What was asked last has ended. If it was a write: how many points' EEPROM it wore out, as far as anybody
+    /// can know. Exception 6 is a request that has not been carried out and is to be sent again, 5 one that is
+    /// being carried out (Modbus application protocol V1.1b3, 7). Also 1 to 3 should come before anything is
+    /// done, but there are devices that answer 3 and write the nearest value.
+    pub(in crate::engine::bus) fn has_written(
+        &mut self,
+        result: &Result<Answer, RequestError>,
+        context: &mut Context,
+    ) -> u64 {
+        let writes = self.wear.end(*result != Err(RequestError::Exception(6)));
+        if writes > 0 {
+            self.counters.persistent_writes += writes;
+            self.keeping.has_changed(context);
+        }
+        writes
     }
 
     /// Words that a command has read at the point's own place.

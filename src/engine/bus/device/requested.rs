@@ -147,20 +147,18 @@ impl DeviceState {
         points.iter().find_map(|point| self.is_spent(now, *point))
     }
 
-    /// One write to all of `points` goes out. How often EEPROM is written by it.
+    /// One write to all of `points` goes out.
     pub(in crate::engine::bus) fn about_to_write_raw(
         &mut self,
         now: Time,
         points: &[PointIndex],
         context: &mut Context,
-    ) -> u64 {
+    ) {
         let writes = self.counters.writes + 1;
-        let before = self.counters.persistent_writes;
         for point in points {
             self.about_to_write(now, *point, context);
         }
         self.counters.writes = writes;
-        self.counters.persistent_writes - before
     }
 
     /// What a raw write may have changed is read again, and told.

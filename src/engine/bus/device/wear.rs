@@ -23,13 +23,23 @@ pub(super) struct Wear {
     left_at: Time,
     /// The points of which a value waits until they may be written again.
     pub(super) waiting: Vec<PointIndex>,
+    /// The points that are being written, and how all was before.
+    writing: Vec<PointIndex>,
+    before: Option<Box<Wear>>,
 }
 
 impl Wear {
     /// A device that may be written as often as its `rules` say.
     pub(super) fn new(rules: Eeprom) -> Wear {
-        let (written_at, waiting) = (BTreeMap::new(), Vec::new());
-        Wear { rules, written_at, left: Wear::full(rules), left_at: Time::default(), waiting }
+        Wear {
+            rules,
+            written_at: BTreeMap::new(),
+            left: Wear::full(rules),
+            left_at: Time::default(),
+            waiting: Vec::new(),
+            writing: Vec::new(),
+            before: None,
+        }
     }
 
     fn full(rules: Eeprom) -> u64 {
@@ -41,11 +51,28 @@ impl Wear {
         self.left = (u64::from(writes_left) * WRITE).min(Wear::full(self.rules));
     }
 
-    /// The point is being written.
+    /// The point is being written, perhaps with others.
     pub(super) fn spend(&mut self, now: Time, point: PointIndex) {
+        if self.writing.is_empty() {
+            self.before = Some(Box::new(Wear { before: None, ..self.clone() }));
+        }
+        self.writing.push(point);
         self.written_at.insert(point, now);
         self.left = self.left(now).saturating_sub(WRITE);
         self.left_at = now;
+    }
+
+    /// The write has ended; how many points' EEPROM it wore out. One that the device has not carried out was none.
+    pub(super) fn end(&mut self, is_carried_out: bool) -> u64 {
+        let writing = std::mem::take(&mut self.writing);
+        match self.before.take() {
+            Some(before) if !is_carried_out => {
+                let Wear { written_at, left, left_at, .. } = *before;
+                (self.written_at, self.left, self.left_at) = (written_at, left, left_at);
+                0
+            }
+            _ => writing.len() as u64,
+        }
     }
 
     /// From when on the point may be written, as far as its own interval goes.
@@ -98,7 +125,7 @@ mod tests {
             for point in 0..points {
                 if now >= wear.allowed_at(point) && wear.spent(now).is_none() {
                     wear.spend(now, point);
-                    writes += 1;
+                    writes += wear.end(true) as u32;
                 }
             }
         }
@@ -125,5 +152,24 @@ mod tests {
         let told = wear.spent(now).expect("nothing is left");
         assert!(told.contains("200 writes in 24 hours") && told.contains("may come in "), "{told}");
         assert!(wear.spent(wear.budget_at()).is_none());
+    }
+
+    #[test]
+    fn what_the_device_did_not_do_wears_nothing() {
+        let mut wear = Wear::new(RULES);
+        let at = |seconds: u64| Time::from_millis(seconds * 1000);
+        wear.spend(at(5), 1);
+        assert_eq!(wear.end(true), 1);
+        let before = wear.clone();
+        for point in [1, 2] {
+            wear.spend(at(100), point);
+        }
+        assert_eq!((wear.allowed_at(1), wear.writes_left(at(100))), (at(160), 97));
+        wear.waiting = vec![7];
+        assert_eq!(wear.end(false), 0);
+        assert_eq!((wear.allowed_at(1), wear.allowed_at(2)), (at(65), Time::default()));
+        assert_eq!(wear.writes_left(at(100)), before.writes_left(at(100)));
+        assert_eq!(wear.waiting, [7], "what came meanwhile is kept");
+        assert_eq!(wear.end(true), 0, "nothing is being written");
     }
 }
