@@ -26,6 +26,8 @@ use crate::engine::topics::Message;
 
 /// How often a bus is told the date.
 const DATE_EACH: Duration = Duration::from_secs(1);
+/// So many messages find room that no memory is asked for.
+const OUTGOING_KEPT: usize = 16;
 /// Looks that may wait for a bus.
 pub(super) const LOOKS_MAX: usize = 64;
 
@@ -56,14 +58,16 @@ enum Port {
 }
 
 /// A bus and its link. Whoever runs it calls [`BusRunner::begin`], waits for what comes first of bytes
-/// ([`BusRunner::link`]), the bell and [`BusRunner::wake_at`], calls [`BusRunner::woken`], and so on until
-/// [`BusRunner::is_finished`].
+/// ([`BusRunner::link`]), the bell and [`BusRunner::wake_at`], calls [`BusRunner::woken`] and
+/// [`BusRunner::publish`], and so on until [`BusRunner::is_finished`].
 pub(super) struct BusRunner {
     settings: Arc<Settings>,
     index: usize,
     clock: Clock,
     state: Arc<StateFiles>,
     publish: Box<dyn Fn(Message) + Send>,
+    /// What is to be published when the thread has time for it.
+    outgoing: Vec<Message>,
     bus: Bus,
     port: Port,
     inbox: Arc<Mutex<Inbox>>,
@@ -98,6 +102,7 @@ impl BusRunner {
             clock,
             state,
             publish,
+            outgoing: Vec::new(),
             bus,
             port: Port::Closed,
             inbox,
@@ -125,8 +130,17 @@ impl BusRunner {
         self.bus.is_finished()
     }
 
+    /// Publishes what there is to publish. To be called after [`BusRunner::begin`] and [`BusRunner::woken`],
+    /// when nobody waits for an answer any more: whoever takes messages to the broker may take the core as well.
+    pub(super) fn publish(&mut self) {
+        self.outgoing.drain(..).for_each(&self.publish);
+        // At the start every value was in it at once.
+        self.outgoing.shrink_to(OUTGOING_KEPT);
+    }
+
     /// The last thing that is done with it.
     pub(super) fn finish(mut self) {
+        self.publish();
         // Perhaps nobody waits.
         let _ = self.ended.try_send(std::mem::take(&mut self.saving));
     }
@@ -216,7 +230,7 @@ impl BusRunner {
                     if message.topic.ends_with("/availability") || message.topic.ends_with("/info") {
                         self.stir.stir();
                     }
-                    (self.publish)(message);
+                    self.outgoing.push(message);
                 }
                 Action::Store(record) => self.state.store(record),
                 Action::Record { recording, request } => self.record(*recording, request),

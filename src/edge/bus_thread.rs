@@ -188,12 +188,14 @@ fn run_alone(mut runner: BusRunner) {
     wake_punctually();
     let mut punctual = Punctual::default();
     runner.begin();
+    runner.publish();
     while !runner.is_finished() {
         let woken = wait_alone(&mut runner, &mut punctual);
         if woken.bell {
             runner.bell().silence();
         }
         runner.woken(woken.bell, woken.link);
+        runner.publish();
     }
     runner.finish();
 }
@@ -283,9 +285,8 @@ impl SharedThread {
             }
             // Only those that have something to do are looked at: most of the time replies come, and there is
             // nothing else.
-            for event in heard.drain(..) {
-                let number = event.data.u64();
-                if let Ok(at) = self.runners.binary_search_by_key(&number, |numbered| numbered.number) {
+            for event in &heard {
+                if let Some(at) = self.runner_of(event) {
                     self.runners[at].is_heard = true;
                     if !rung {
                         self.go_on(at, false);
@@ -295,10 +296,22 @@ impl SharedThread {
             if rung || self.wake_at.is_some_and(|at| self.clock.now() >= at) {
                 self.look_at_all(rung);
             }
+            // All that answered have been asked again.
+            for event in heard.drain(..) {
+                if let Some(at) = self.runner_of(&event) {
+                    self.runners[at].runner.publish();
+                }
+            }
             if self.runners.is_empty() && self.shared.closing.load(Ordering::SeqCst) {
                 return;
             }
         }
+    }
+
+    /// Where the bus is that the event is about, if there still is one.
+    fn runner_of(&self, event: &epoll::Event) -> Option<usize> {
+        let number = event.data.u64();
+        self.runners.binary_search_by_key(&number, |numbered| numbered.number).ok()
     }
 
     /// Waits for whatever comes first.
@@ -314,6 +327,7 @@ impl SharedThread {
         for at in 0..self.runners.len() {
             if rung || self.runners[at].wake_at.is_some_and(|at| now >= at) {
                 self.go_on(at, rung);
+                self.runners[at].runner.publish();
             }
         }
         while let Some(at) = self.runners.iter().position(|numbered| numbered.runner.is_finished()) {
@@ -338,6 +352,7 @@ impl SharedThread {
             runner.begin();
             let mut numbered = Numbered { number: self.next_number, runner, wake_at: None, is_heard: false };
             numbered.settle(&self.epoll);
+            numbered.runner.publish();
             self.runners.push(numbered);
             self.next_number += 1;
         }
