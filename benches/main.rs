@@ -4,6 +4,7 @@
 //! `docs/performance.md`; every run writes `target/bench.json`.
 
 mod clock;
+mod cores;
 mod frames;
 mod machine;
 mod mqtt;
