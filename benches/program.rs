@@ -1,4 +1,7 @@
 //! The programs of a measurement: a real mosquitto, and the release build of busker.
+//!
+//! They are not those of the tests' support: there a failure panics, while here the next row is measured; what
+//! the program says goes to a file, so that no thread of ours wakes for it; and the broker holds nothing back.
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};

@@ -61,11 +61,23 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
         // A command that is written twice is as bad as none.
         lost += matching.count();
     }
-    let outcomes = rig.observer.take();
-    let done = outcomes
+    let messages = rig.observer.take();
+    let done = messages
         .iter()
         .filter(|message| message.topic.ends_with("/outcome") && message.payload.contains("\"done\""))
         .count();
+    // The observer is told of each command by the broker when the gateway is: from there on it waits.
+    let passed_on: BTreeMap<u16, i64> = messages
+        .iter()
+        .filter(|message| message.topic.ends_with("/set"))
+        .filter_map(|message| Some((message.payload.parse().ok()?, message.at)))
+        .collect();
+    let waits: Vec<f64> = writes
+        .iter()
+        .filter_map(|seen| Some((seen.heard_at - passed_on.get(&seen.argument)?) as f64 / 1e6))
+        .collect();
+    let ways: Vec<f64> =
+        sent.iter().filter_map(|(value, at)| Some((passed_on.get(value)? - at) as f64 / 1e6)).collect();
     let silence = W1_LINE.silence();
     let violations =
         transactions.iter().filter_map(|seen| seen.silence).filter(|found| *found < silence).count() as u64;
@@ -94,9 +106,12 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
         Figure::new("W4", "command to its first byte, p95", Target::AtMost(36.0), " ms")
             .reached([late])
             .remark(format!("the latest {:.1} ms", greatest(&latencies).unwrap_or_default())),
-        Figure::new("W4", "worst wait as `busker check` says ÷ the latest", Target::None, "")
-            .reached([forecast * 1e3 / greatest(&latencies).unwrap_or(f64::INFINITY)])
-            .remark("beside the wait itself, the latest one took its way through the broker"),
+        Figure::new("W4", "worst wait as `busker check` says ÷ the longest", Target::Between(0.95, 1.05), "")
+            .reached([forecast * 1e3 / greatest(&waits).unwrap_or(f64::INFINITY)])
+            .remark(format!(
+                "without the way through the broker, at most {:.1} ms; `target/bench/W4.yaml`",
+                greatest(&ways).unwrap_or_default()
+            )),
         Figure::new("W4", "commands lost or written twice", Target::AtMost(0.0), "")
             .reached([lost as f64])
             .remark(format!("{done} of {count} outcomes say `done`")),
