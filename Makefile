@@ -3,7 +3,7 @@
 # Appended to PATH, so that nobody's own programs are hidden.
 WITH_MOSQUITTO = tools=$$(scripts/get-mosquitto) && PATH="$$PATH:$$tools"
 
-.PHONY: demo test test-page test-wireshark test-home-assistant lint goldens bench soak
+.PHONY: demo test test-page test-wireshark test-openmetrics test-home-assistant lint goldens bench soak
 
 # The whole program without hardware: simulated devices, a broker, the gateway. Ctrl-C ends it.
 demo:
@@ -22,6 +22,11 @@ test-page:
 test-wireshark:
 	@$(WITH_MOSQUITTO) && tshark=$$(scripts/get-tshark) && PATH="$$PATH:$$tshark" \
 		exec cargo test --locked --test line wireshark -- --include-ignored
+
+# What Prometheus's own strict reader makes of /metrics; it is fetched from PyPI into target.
+test-openmetrics:
+	@$(WITH_MOSQUITTO) && BUSKER_OPENMETRICS_PYTHON="$$(scripts/get-openmetrics-reader)" \
+		exec cargo test --locked --test field strict_reader -- --include-ignored
 
 # The discovery messages against a real Home Assistant core; downloads about 800 MB the first time.
 test-home-assistant:

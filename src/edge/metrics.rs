@@ -13,7 +13,8 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
 use crate::engine::health::{
-    BusHealth, Counters, GatewayReport, Readout, ReadoutValue, SpreadReport, TimingReport,
+    BusHealth, Counters, GatewayReport, Percentiles, PeriodReport, Readout, ReadoutValue, SpreadReport,
+    TimingReport,
 };
 
 /// What a scraper is told that it gets.
@@ -58,39 +59,24 @@ pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
         "Share of the last minute in which the wire was busy",
         of_buses(&|bus| bus.report.load),
     );
-    let all_buses = report
-        .buses
-        .iter()
-        .map(|bus| (vec![("bus", bus.report.name.clone())], &bus.report.counters))
-        .collect();
-    wire_counters(&mut registry, "bus", all_buses);
     let all_buses = || report.buses.iter().map(|bus| (vec![("bus", bus.report.name.clone())], &bus.report));
+    wire_counters(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.counters)).collect());
     codes(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.counters)));
     times(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.timing)));
+    periods(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, bus.periods())));
 
     let labels = |bus: &str, device: &str| vec![("bus", bus.to_string()), ("device", device.to_string())];
-    let online = report
-        .devices()
-        .map(|(bus, device)| (labels(&bus.name, &device.name), flag(device.online)))
-        .collect();
-    gauges(&mut registry, "device_online", "Whether the device answers", online);
-    let all_devices =
-        report.devices().map(|(bus, device)| (labels(&bus.name, &device.name), &device.counters)).collect();
-    wire_counters(&mut registry, "device", all_devices);
     let all_devices = || report.devices().map(|(bus, device)| (labels(&bus.name, &device.name), device));
+    let online = all_devices().map(|(labels, device)| (labels, flag(device.online))).collect();
+    gauges(&mut registry, "device_online", "Whether the device answers", online);
+    let loads = all_devices().map(|(labels, device)| (labels, device.load)).collect();
+    let help = "Share of the last minute in which the wire was busy with it";
+    gauges(&mut registry, "device_load_ratio", help, loads);
+    let counted = all_devices().map(|(labels, device)| (labels, &device.counters)).collect();
+    wire_counters(&mut registry, "device", counted);
     codes(&mut registry, "device", all_devices().map(|(labels, device)| (labels, &device.counters)));
     times(&mut registry, "device", all_devices().map(|(labels, device)| (labels, &device.timing)));
-    let (mut real, mut wanted) = (Vec::new(), Vec::new());
-    for (labels, device) in all_devices() {
-        for period in &device.periods {
-            let labels = [&labels[..], &[("class", period.class.name().to_string())]].concat();
-            real.extend(period.real.map(|real| (labels.clone(), real.as_secs_f64())));
-            wanted.push((labels, period.wanted.as_secs_f64()));
-        }
-    }
-    let help = "How often the reads of a poll class come round";
-    gauges(&mut registry, "device_period_seconds", help, real);
-    gauges(&mut registry, "device_wanted_period_seconds", "How often they should", wanted);
+    periods(&mut registry, "device", all_devices().map(|(labels, device)| (labels, device.periods.clone())));
     registry.register_collector(Box::new(readings));
 
     let mut text = String::new();
@@ -143,22 +129,52 @@ fn codes<'c>(registry: &mut Registry, of: &str, counted: impl Iterator<Item = (L
     counters(registry, &format!("{of}_exceptions_by_code"), help, values);
 }
 
-/// One histogram for each kind of time that has been seen.
+/// How often the reads of a poll class come round, and how often they should.
+fn periods(registry: &mut Registry, of: &str, told: impl Iterator<Item = (Labels, Vec<PeriodReport>)>) {
+    let (mut real, mut wanted) = (Vec::new(), Vec::new());
+    for (labels, periods) in told {
+        for period in periods {
+            let labels = [&labels[..], &[("class", period.class.name().to_string())]].concat();
+            real.extend(period.real.map(|real| (labels.clone(), real.as_secs_f64())));
+            wanted.push((labels, period.wanted.as_secs_f64()));
+        }
+    }
+    let help = "How often the reads of a poll class come round";
+    gauges(registry, &format!("{of}_period_seconds"), help, real);
+    gauges(registry, &format!("{of}_wanted_period_seconds"), "How often they should", wanted);
+}
+
+/// One histogram for each kind of time that has been seen, and how it was lately.
 fn times<'t>(registry: &mut Registry, of: &str, timings: impl Iterator<Item = (Labels, &'t TimingReport)>) {
     let timings: Vec<(Labels, &TimingReport)> = timings.collect();
     for (index, (name, _)) in TimingReport::default().list().into_iter().enumerate() {
         let told = |(labels, timing): &(Labels, &TimingReport)| {
             Some((labels.clone(), timing.list()[index].1.clone()?))
         };
-        let values = timings.iter().filter_map(told).collect();
+        let values: Vec<_> = timings.iter().filter_map(told).collect();
         let help = match name {
             "turnaround" => "From a read's last character to the first one of its answer.",
             "gap_wait" => "From the decision on a request until it was on the wire.",
             "lateness" => "How much of that the silence before a request did not ask for.",
             _ => "From a command's arrival until it was on the wire.",
         };
-        let name = format!("{of}_{name}_seconds");
-        registry.register_collector(Box::new(Histograms { name, help, values }));
+        let mut lately = Vec::new();
+        for (labels, spread) in &values {
+            let Some(percentiles) = spread.lately else { continue };
+            let Percentiles { p50, p95, p99 } = percentiles;
+            for (percentile, time) in [("50", p50), ("95", p95), ("99", p99)] {
+                let labels = [&labels[..], &[("percentile", percentile.to_string())]].concat();
+                lately.push((labels, time.as_secs_f64()));
+            }
+        }
+        let whole = format!("{of}_{name}_seconds");
+        registry.register_collector(Box::new(Histograms { name: whole, help, values }));
+        gauges(
+            registry,
+            &format!("{of}_{name}_lately_seconds"),
+            "Lately: so many of a hundred took at most this",
+            lately,
+        );
     }
 }
 
@@ -283,6 +299,7 @@ mod tests {
             unit: 1,
             online: true,
             counters: Counters { timeouts: 7, exceptions_by_code, ..Counters::default() },
+            load: 0.125,
             ..DeviceReport::default()
         };
         let report = BusReport {
@@ -323,6 +340,10 @@ mod tests {
             "busker_device_turnaround_seconds_bucket{le=\"0.002\",bus=\"cellar\",device=\"relays\"} 0",
             "busker_device_turnaround_seconds_bucket{le=\"0.005\",bus=\"cellar\",device=\"relays\"} 2",
             "busker_device_turnaround_seconds_bucket{le=\"+Inf\",bus=\"cellar\",device=\"relays\"} 3",
+            "busker_device_turnaround_lately_seconds{bus=\"cellar\",device=\"relays\",percentile=\"99\"} 0.0397",
+            "busker_device_load_ratio{bus=\"cellar\",device=\"relays\"} 0.125",
+            "busker_bus_period_seconds{bus=\"cellar\",class=\"fast\"} 0.4",
+            "busker_bus_wanted_period_seconds{bus=\"cellar\",class=\"fast\"} 0.25",
             "busker_device_period_seconds{bus=\"cellar\",device=\"relays\",class=\"fast\"} 0.4",
             "busker_device_wanted_period_seconds{bus=\"cellar\",device=\"relays\",class=\"fast\"} 0.25",
             "# TYPE busker_reading gauge",

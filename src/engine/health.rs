@@ -120,6 +120,21 @@ pub struct BusReport {
     pub devices: Vec<DeviceReport>,
 }
 
+impl BusReport {
+    /// By poll class, the period that is the farthest from what is wanted: all others are kept better.
+    pub fn periods(&self) -> Vec<PeriodReport> {
+        let stretch = |period: &PeriodReport| {
+            period.real.map_or(0.0, |real| real.as_secs_f64() / period.wanted.as_secs_f64())
+        };
+        let worst = |class: Poll| {
+            let of_class = self.devices.iter().flat_map(|device| &device.periods);
+            let of_class = of_class.filter(|period| period.class == class);
+            of_class.max_by(|one, other| stretch(one).total_cmp(&stretch(other))).copied()
+        };
+        [Poll::Fast, Poll::Slow].into_iter().filter_map(worst).collect()
+    }
+}
+
 /// A device as it is now.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct DeviceReport {
@@ -135,6 +150,8 @@ pub struct DeviceReport {
     /// What the device said of itself: `METZ CONNECT GmbH MR-DO4 V1.4`.
     pub identity: Option<String>,
     pub counters: Counters,
+    /// The share of the last minute in which the wire was busy with it, 0 to 1.
+    pub load: f64,
     pub last_answer_at: Option<Time>,
     pub timing: TimingReport,
     pub periods: Vec<PeriodReport>,
@@ -453,7 +470,7 @@ mod tests {
     fn reports_are_told_by_name_and_as_lists() {
         let report = gateway(true, true, true, &[false]);
         let health = report.to_json();
-        assert_eq!(health["buses"]["cellar"]["load"], 0.123);
+        assert_eq!(health["buses"]["cellar"]["load"], 0.12346);
         assert_eq!(health["devices"]["d0"]["reason"], "no answer in time");
         assert_eq!(health["devices"]["d0"]["timeouts"], 3);
         assert_eq!(report.buses_json()[0]["name"], "cellar");
@@ -465,7 +482,7 @@ mod tests {
     }
     #[test]
     fn only_what_was_read_in_time_on_a_bus_that_is_heard_is_fresh() {
-        let missing = Some(("offline", "the device does not answer".to_string()));
+        let missing = Some(("offline", "the device is offline".to_string()));
         for (what, point, seconds, is_heard, expected) in [
             ("just read", flow(), 2, true, Freshness::Fresh),
             ("three turns missed", flow(), 6, true, Freshness::Old),

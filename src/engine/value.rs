@@ -226,7 +226,7 @@ impl fmt::Display for Missing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Missing::NotYetRead => write!(f, "not yet read"),
-            Missing::Offline => write!(f, "the device does not answer"),
+            Missing::Offline => write!(f, "the device is offline"),
             Missing::WaitingFor(point) => write!(f, "waiting for {point}"),
             Missing::NotInThisMode => write!(f, "no reading in this mode"),
             Missing::Invalid(reason) => write!(f, "{reason}"),

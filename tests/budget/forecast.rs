@@ -159,7 +159,10 @@ fn load_and_periods_are_those_of_the_running_bus() {
         wire.asked.clear();
         wire.run_until(RUN);
         let load = forecast["load"].as_f64().expect("a load").min(1.0);
-        agree(&format!("{}: load", case.what), &load.into(), wire.bus.report(wire.now).load);
+        let told = wire.bus.report(wire.now);
+        agree(&format!("{}: load", case.what), &load.into(), told.load);
+        let of_devices: f64 = told.devices.iter().map(|device| device.load).sum();
+        assert!((of_devices - told.load).abs() < 0.001, "{}: {of_devices}, {}", case.what, told.load);
         for ((unit, address), found) in wire.periods() {
             let class = if address >= 500 || case.devices[0].1.starts_with("fast0: {at: holding") {
                 "fast"

@@ -2,6 +2,7 @@
 //! false is published, and nothing is lost. The table of `docs/field-problems.md` is made from the rows.
 
 mod devices;
+mod figures;
 mod lines;
 #[path = "../support/peer.rs"]
 mod peer;

@@ -13,7 +13,7 @@ pub const ROWS: &[Row] = &[
         number: 1,
         fault: "A late reply is taken for the next answer: RTU frames carry no number",
         done: "A unit whose replies all look alike answers after its timeout, after the next request, and twice so in a row, with what it no longer holds",
-        seen: "Leaves the line silent for a quarantine, and believes the first reply to a look-alike request only when no second one comes: counted as `late_replies`, never shown",
+        seen: "Leaves the line silent for a quarantine, asks something else first, and believes the first reply to a look-alike request only when no second one comes: counted as `late_replies`, never shown",
         run: late_replies,
     },
     Row {
@@ -62,7 +62,7 @@ pub const ROWS: &[Row] = &[
         number: 23,
         fault: "Nobody can tell a timeout from a wrong checksum",
         done: "One unit is silent, one answers with a wrong checksum, one as another unit",
-        seen: "Counts each as what it is (`timeouts`, `checksum_errors`, `wrong_frames`), and says so as the device's reason: look for its power and address, for the wire, for a second unit of that address",
+        seen: "Counts each as what it is (`timeouts`, `checksum_errors`, `wrong_frames`), and the device's reason says what to check: its power, wiring and unit; the wire; whether another device has its unit",
         run: three_faults,
     },
     Row {
@@ -112,6 +112,10 @@ fn lie(asked: &Asked) -> Vec<u8> {
     rtu(asked.unit, &read_pdu(4, &[LIE]))
 }
 
+fn place(asked: &Asked) -> (u8, u8, u16) {
+    (asked.unit, asked.function, asked.address)
+}
+
 /// Does each of these to one read of `one/a`, whose register changes at the same time.
 fn each_once(stage: &Stage, peer: &Peer, faults: &[Misbehave]) {
     for how in faults {
@@ -136,6 +140,15 @@ fn late_replies() {
         ],
     );
     stage.counts("late_replies", 3);
+    // What was not answered is not what is asked next, if there is anything else to ask.
+    let (from, a) = (peer.asked().len(), (1, 4, 0));
+    peer.misbehave_once(1, 4, 0, |_, _| Vec::new());
+    let after = wait_for("the request behind it", || {
+        let asked = peer.asked();
+        let unanswered = (from..asked.len()).find(|at| place(&asked[*at]) == a)?;
+        asked.get(unanswered + 1).cloned()
+    });
+    assert_ne!(place(&after), a, "the same again at once");
     // Two in a row of which nothing comes until the third.
     let mut unanswered = Vec::new();
     peer.misbehave(move |asked, good| match unanswered.len() {
@@ -306,17 +319,23 @@ fn three_faults() {
     let devices =
         unit("silent", 1, "") + &unit("damaged", 2, "") + &unit("mistaken", 3, "") + &unit("good", 4, "");
     let stage = Stage::start(&peer, "response_timeout: 250ms", &devices, &[("good/a", (4, 4, 0))]);
-    for (device, counter, reason) in [
-        ("silent", "timeouts", "no answer in time"),
-        ("damaged", "checksum_errors", "checksum error"),
-        ("mistaken", "wrong_frames", "an answer that does not fit the request"),
+    for (device, counter, reason, advice) in [
+        ("silent", "timeouts", "no answer in time", "check its power, its wiring and its unit"),
+        ("damaged", "checksum_errors", "checksum error", "check the wire"),
+        (
+            "mistaken",
+            "wrong_frames",
+            "an answer that does not fit the request",
+            "another device has its unit",
+        ),
     ] {
         let said = wait_for(device, || {
             let said = stage.device(device);
             let is_offline = said["reason"].as_str().is_some_and(|said| said.contains("3 times in a row"));
             is_offline.then_some(said)
         });
-        assert!(said["reason"].as_str().is_some_and(|said| said.starts_with(reason)), "{said}");
+        let told = said["reason"].as_str().unwrap_or_default();
+        assert!(told.starts_with(reason) && told.contains(advice), "{said}");
         assert!(said["counters"][counter].as_u64() >= Some(3), "{said}");
         for other in ["timeouts", "checksum_errors", "wrong_frames"] {
             // A thread that was kept waiting may answer too late.

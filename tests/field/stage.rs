@@ -49,8 +49,7 @@ impl<'p> Stage<'p> {
                 peer.hold(*unit, *function, *address, if *function > 2 { number * 100 } else { 0 });
             }
         }
-        let configuration =
-            format!("home_assistant: {{discovery: false}}\nbuses: {{line: {{{link}}}}}\ndevices:\n{devices}");
+        let configuration = format!("buses: {{line: {{{link}}}}}\ndevices:\n{devices}");
         let gateway = Gateway::start(&broker, &configuration);
         Stage { gateway, watcher, _broker: broker, peer, shown: shown.to_vec(), commands: RefCell::default() }
     }

@@ -143,7 +143,7 @@ fn who_watches_is_told_everything_first_and_then_what_changes() {
     let told = events.wait_for("points", |data| data["device"] == "relays");
     let relay = point(&told, "relay_3").expect("it is told");
     assert_eq!((&relay["value"], &relay["freshness"]), (&"None".into(), &"missing".into()));
-    assert_eq!(relay["reason"], "the device does not answer");
+    assert_eq!(relay["reason"], "the device is offline");
 
     // A second reader is told all of it at once.
     let (first, state) = Events::open(&gateway, None).next();

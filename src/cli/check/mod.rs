@@ -174,9 +174,12 @@ impl Summary {
         for bus in &self.buses {
             let line = bus.line.as_ref().map_or(String::new(), |line| format!(" {line}"));
             text.push_str(&format!("\nbus {}: {}{line}\n", bus.name, bus.link));
+            let busy = match bus.load > 1.0 {
+                true => "busy all the time".to_string(),
+                false => format!("busy {:.0} % of the time", (bus.load * 100.0).max(0.0)),
+            };
             text.push_str(&format!(
-                "  busy {:.0} % of the time; a command waits at most {}, {} while a device is silent\n",
-                (bus.load * 100.0).max(0.0),
+                "  {busy}; a command waits at most {}, {} while a device is silent\n",
                 told(bus.command_wait),
                 told(bus.command_wait_one_silent),
             ));

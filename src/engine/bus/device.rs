@@ -22,7 +22,7 @@ use crate::engine::device::{Device, Point, PointIndex, Poll};
 use crate::engine::health::Counters;
 use crate::engine::homeassistant::{self, Outline};
 use crate::engine::identity;
-use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
+use crate::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
 use crate::engine::plan::{self, Read, Tariff};
 use crate::engine::schedule::{Outlook, Pace, Place, Polls, Urgency};
 use crate::engine::settings::{DeviceSettings, Eeprom};
@@ -31,6 +31,7 @@ use crate::engine::time::{Duration, Time};
 use crate::engine::upkeep::Upkeep;
 use crate::engine::value::Missing;
 
+use super::load::Load;
 use super::waiting::Target;
 use super::{Context, Severity};
 use beats::Beats;
@@ -54,6 +55,8 @@ pub(super) struct DeviceState {
     /// What is lost with each request of the silence that it wants.
     pub(super) idle_rest: Duration,
     turnaround: Turnaround,
+    /// Its share of the wire.
+    load: Load,
     values: Values,
     polls: Polls,
     /// What the device has refused to give in one answer.
@@ -143,6 +146,7 @@ impl DeviceState {
             tariff,
             idle_rest,
             turnaround,
+            load: Load::default(),
             values,
             polls,
             refused: Vec::new(),
@@ -395,7 +399,8 @@ impl DeviceState {
 
     pub(super) fn count(&mut self, now: Time, reply: &Reply, is_read: bool) {
         self.counters.count_result(&reply.result);
-        self.counters.count_discarded(reply.discarded);
+        // What was late may be another's.
+        self.counters.count_discarded(Discarded { late_replies: 0, ..reply.discarded });
         self.last_answer_end = reply.last_byte_at.unwrap_or(now);
         if matches!(reply.result, Ok(_) | Err(RequestError::Exception(_))) {
             self.last_answer_at = Some(now);
@@ -484,7 +489,8 @@ impl DeviceState {
         let demanded = self.settings.device.wire.response_timeout;
         self.paused_until = now + self.patience.pause(self.full_timeout, demanded, self.settings.unit);
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {
-            let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row");
+            let advice = error.what_to_check().map_or(String::new(), |advice| format!("; {advice}"));
+            let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row{advice}");
             context.say(Severity::Warning, format!("device {} is offline: {reason}", self.settings.name));
             self.lose(now, &reason, context);
         }
@@ -498,6 +504,11 @@ impl DeviceState {
     /// Whether the request that ends now only asked whether it is there again.
     pub(super) fn is_probed(&self) -> bool {
         self.patience.is_probing()
+    }
+
+    /// So many of its answers came too late.
+    pub(super) fn count_late(&mut self, answers: u32) {
+        self.counters.late_replies += u64::from(answers);
     }
 
     /// Its answer to an earlier request was heard, so long after that.

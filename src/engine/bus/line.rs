@@ -5,8 +5,8 @@
 
 use std::collections::VecDeque;
 
-use super::{Action, Bus, InFlight, Severity};
-use crate::engine::modbus::{Reply, Request, RequestError, RequestsOfOthers};
+use super::{Action, Bus, DeviceState, InFlight, Severity};
+use crate::engine::modbus::{Discarded, Reply, Request, RequestError, RequestsOfOthers};
 use crate::engine::settings::Link;
 use crate::engine::time::{Duration, Time};
 
@@ -89,6 +89,15 @@ impl Bus {
             None => (Severity::Info, "no other master has spoken for a minute".into()),
         };
         self.context.say(severity, format!("bus {}: {text}", self.name));
+    }
+
+    /// Counts late answers for the device whose they are: another one may be asked when they come.
+    pub(super) fn count_late(&mut self, asked: Option<usize>, discarded: Discarded) {
+        let is_of = |device: &DeviceState| discarded.late.is_none_or(|late| late.unit == device.unit());
+        let asked = asked.filter(|device| is_of(&self.devices[*device]));
+        if let Some(device) = asked.or_else(|| self.devices.iter().position(is_of)) {
+            self.devices[device].count_late(discarded.late_replies);
+        }
     }
 
     /// Whether a device that was not waited for fully is only slower than that: its late answer is heard, or

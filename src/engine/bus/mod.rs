@@ -435,6 +435,7 @@ impl Bus {
             self.unanswered =
                 if reply.result == Err(RequestError::Timeout) { self.unanswered + 1 } else { 0 };
         }
+        self.count_late(in_flight.device, reply.discarded);
         if matches!(reply.result, Ok(_) | Err(RequestError::Exception(_) | RequestError::Unreachable(_))) {
             self.connection.answered(self.now);
         }

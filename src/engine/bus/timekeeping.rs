@@ -77,12 +77,16 @@ impl Bus {
         self.times.quiet_since = reply.last_byte_at.filter(|_| answered);
 
         // Who left the line to a quarantine pays for it, and not who had to wait.
-        if let Some(silent) = self.times.to_blame.take() {
+        let own_from = silent_from.max(busy_from);
+        let blamed = self.times.to_blame.take();
+        if let Some(silent) = blamed {
             self.devices[silent].charge(now, waited);
+            self.devices[silent].had_wire(busy_from, own_from);
         }
         let timed_out = reply.result == Err(RequestError::Timeout);
         self.times.to_blame = asked.device.filter(|device| timed_out && self.devices[*device].is_probed());
         if let Some(device) = asked.device {
+            self.devices[device].had_wire(if blamed.is_some() { own_from } else { busy_from }, now);
             self.devices[device].keep_time(now, waited, turnaround, command_waited);
             turnaround
                 .into_iter()

@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use serde_json::{Map, Value, json};
 
 use super::{
-    BusHealth, Counters, DeviceReport, Drift, GatewayReport, Percentiles, PointReport, ThingReport,
-    TimingReport,
+    BusHealth, Counters, DeviceReport, Drift, GatewayReport, Percentiles, PeriodReport, PointReport,
+    ThingReport, TimingReport,
 };
 use crate::engine::settings::Settings;
 use crate::engine::time::{Duration, Time};
@@ -114,25 +114,13 @@ impl DeviceReport {
             "reason": self.reason,
             "bus": bus,
             "unit": self.unit,
-            "periods": self.periods_json(),
+            "load": share(self.load),
+            "periods": periods_json(&self.periods),
         }));
         value.extend(counters_json(&self.counters));
         value.insert("exceptions_by_code".into(), codes_json(&self.counters));
         value.extend(times_json(&self.timing, false));
         value.into()
-    }
-
-    fn periods_json(&self) -> Value {
-        let periods: Map<String, Value> = self
-            .periods
-            .iter()
-            .map(|period| {
-                let told =
-                    json!({"wanted_seconds": seconds(period.wanted), "seconds": period.real.map(seconds)});
-                (period.class.name().to_string(), told)
-            })
-            .collect();
-        periods.into()
     }
 }
 
@@ -156,7 +144,8 @@ fn bus_json(bus: &BusHealth) -> Value {
         "reason": report.reason,
         "paused": report.paused,
         "responding": bus.responding,
-        "load": (report.load * 1000.0).round() / 1000.0,
+        "load": share(report.load),
+        "periods": periods_json(&report.periods()),
     }));
     value.extend(counters_json(&report.counters));
     value.insert("exceptions_by_code".into(), codes_json(&report.counters));
@@ -180,7 +169,8 @@ pub fn device_json(bus: &BusHealth, device: &DeviceReport, now: Time) -> Value {
         "reason": device.reason,
         "identity": device.identity,
         "last_answer_seconds_ago": device.last_answer_at.map(|at| seconds(now - at)),
-        "periods": device.periods_json(),
+        "load": share(device.load),
+        "periods": periods_json(&device.periods),
         "counters": counters_json(&device.counters),
         "exceptions_by_code": codes_json(&device.counters),
         "things": things,
@@ -203,6 +193,14 @@ pub fn drift_json(drift: &[Drift]) -> Value {
         })
     };
     drift.iter().map(told).collect()
+}
+
+fn periods_json(periods: &[PeriodReport]) -> Value {
+    let told = |period: &PeriodReport| {
+        let told = json!({"wanted_seconds": seconds(period.wanted), "seconds": period.real.map(seconds)});
+        (period.class.name().to_string(), told)
+    };
+    periods.iter().map(told).collect::<Map<_, _>>().into()
 }
 
 fn counters_json(counters: &Counters) -> Map<String, Value> {
@@ -274,6 +272,11 @@ fn told_missing<'m>(missing: &'m Option<(&'static str, String)>) -> (Option<&'st
 /// With the digits that mean something.
 pub fn seconds(duration: Duration) -> f64 {
     (duration.as_secs_f64() * 1000.0).round() / 1000.0
+}
+
+/// Of a whole: a device that is seldom asked takes less than a thousandth of its wire.
+fn share(share: f64) -> f64 {
+    (share * 100_000.0).round() / 100_000.0
 }
 
 /// What is short is told in hundredths of a millisecond.

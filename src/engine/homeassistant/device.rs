@@ -92,6 +92,7 @@ fn diagnostics(gateway: &Gateway, identity: &str, own: &DeviceTopics, device: &D
             components.push(place.period(class.name(), name, class == Poll::Fast));
         }
     }
+    components.push(place.load("Share of the wire", false));
     components.extend(place.counters(&["timeouts"]));
     components
 }

@@ -32,6 +32,8 @@ enum Looks {
     Milliseconds,
     /// How often polls come round.
     Period,
+    /// Of a whole, in percent.
+    Share,
 }
 
 impl Place<'_> {
@@ -80,6 +82,11 @@ impl Place<'_> {
             Looks::Counter => json!({"state_class": "total_increasing", "suggested_display_precision": 0}),
             Looks::Milliseconds => duration("ms", 1),
             Looks::Period => duration("s", 2),
+            Looks::Share => json!({
+                "unit_of_measurement": "%",
+                "state_class": "measurement",
+                "suggested_display_precision": 1,
+            }),
         };
         let (key, mut component) = self.entity("sensor", key, name, value, more);
         if !enabled {
@@ -138,9 +145,20 @@ impl Place<'_> {
         components
     }
 
-    /// The real period of a poll class.
+    /// How busy the wire is, or is with it. What an earlier version has left at the broker may lack it.
+    pub(super) fn load(&self, name: &str, enabled: bool) -> (String, Map<String, Value>) {
+        let value = "((OBJECT.load * 100) | round(2)) if OBJECT.load is defined else none";
+        self.of_wire("load", name, value, Looks::Share, enabled)
+    }
+
+    /// The real period of a poll class. A bus may have no device with such polls, and what an earlier version
+    /// has told of it no periods at all.
     pub(super) fn period(&self, class: &str, name: &str, enabled: bool) -> (String, Map<String, Value>) {
-        let value = format!("OBJECT.periods.{class}.seconds");
+        let periods = "OBJECT.periods";
+        let mut value = format!("{periods}.{class}.seconds");
+        if self.may_lack {
+            value += &format!(" if {periods} is defined and {periods}.{class} is defined else none");
+        }
         self.of_wire(&format!("{class}_period"), name, &value, Looks::Period, enabled)
     }
 }

@@ -4,6 +4,7 @@ use serde_json::json;
 
 use super::announcement::{Announcement, Gateway};
 use super::diagnostics::{Place, object};
+use crate::engine::device::Poll;
 use crate::engine::health::TOLD_EVERY;
 use crate::engine::topics::{OFFLINE, ONLINE};
 
@@ -61,11 +62,11 @@ pub fn announce_bus(gateway: &Gateway, bus: &str) -> Announcement {
         expiry: gateway.expiry(TOLD_EVERY),
     };
     let link = json!({"device_class": "connectivity"});
-    let load =
-        json!({"unit_of_measurement": "%", "state_class": "measurement", "suggested_display_precision": 1});
     let mut components = vec![
         place.entity("binary_sensor", "link", "Link", "'ON' if OBJECT.up else 'OFF'", link),
-        place.entity("sensor", "load", "Load", "(OBJECT.load * 100) | round(1)", load),
+        place.load("Load", true),
+        place.period(Poll::Fast.name(), "Period of fast polls", false),
+        place.period(Poll::Slow.name(), "Period of slow polls", false),
     ];
     let often = ["requests", "timeouts", "checksum_errors", "exceptions", "late_replies"];
     components.extend(place.counters(&often));

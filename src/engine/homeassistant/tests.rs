@@ -184,7 +184,7 @@ fn how_a_device_is_on_its_wire_is_told_by_few_entities_and_by_more_that_can_be_e
         .map(|(key, _)| key.as_str())
         .collect();
     assert_eq!(enabled, ["wire_turnaround_p95", "wire_fast_period", "wire_timeouts"]);
-    assert_eq!(wire().count(), 14);
+    assert_eq!(wire().count(), 15);
     assert!(wire().all(|(_, component)| component["entity_category"] == "diagnostic"));
     let expected = json!({
         "platform": "sensor",

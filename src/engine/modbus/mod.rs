@@ -173,6 +173,20 @@ impl fmt::Display for RequestError {
     }
 }
 
+impl RequestError {
+    /// Where to look when it comes again and again: each has other causes.
+    pub const fn what_to_check(&self) -> Option<&'static str> {
+        match self {
+            RequestError::Timeout => Some("check its power, its wiring and its unit"),
+            RequestError::Unreachable(_) => Some("check the device behind the gateway"),
+            RequestError::Checksum => Some("check the wire: its ends, its shield, baud rate and parity"),
+            RequestError::WrongFrame => Some("check whether another device has its unit"),
+            RequestError::Collision => Some("check who else speaks on the line"),
+            RequestError::Exception(_) | RequestError::Link(_) | RequestError::Impossible(_) => None,
+        }
+    }
+}
+
 /// The specification's words for an exception code.
 pub const fn exception_name(code: u8) -> &'static str {
     match code {

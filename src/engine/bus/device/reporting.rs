@@ -40,6 +40,7 @@ impl DeviceState {
             reason: self.reason().or(begins),
             identity: self.identity.clone(),
             counters: self.counters,
+            load: self.load.share(now),
             last_answer_at: self.last_answer_at,
             timing: self.turnaround.report(now),
             periods: self.report_periods(now),
@@ -254,7 +255,8 @@ mod tests {
         let report = bus.report(now);
         for device in &report.devices {
             assert!(device.counters.timeouts >= 3, "{:?}", device.counters);
-            assert_eq!(device.reason.as_deref(), Some("no answer in time, 3 times in a row"));
+            let reason = "no answer in time, 3 times in a row; check its power, its wiring and its unit";
+            assert_eq!(device.reason.as_deref(), Some(reason));
             assert!(device.periods.iter().all(|period| period.real.is_none()));
             let events = device.points.iter().filter(|point| point.role == Role::Event);
             assert!(

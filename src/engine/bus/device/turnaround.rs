@@ -94,6 +94,11 @@ impl DeviceState {
         context.say(Severity::Warning, text);
     }
 
+    /// The wire was busy with it.
+    pub(in crate::engine::bus) fn had_wire(&mut self, from: Time, until: Time) {
+        self.load.add(from, until);
+    }
+
     /// A request to it has ended.
     pub(in crate::engine::bus) fn keep_time(
         &mut self,
