@@ -5,8 +5,8 @@
 //! does not say what that time is, only the polls are counted. What may come between: a read of everything
 //! else that is due at the same moment; other watchdogs and heartbeats; and of a device that has just fallen
 //! silent the wait for its answer, as long again in which the line is left alone, and a round of everything
-//! else that has become due meanwhile. Commands are not counted: they put a feeding off until two thirds of
-//! the time have passed, and no further.
+//! else that has become due meanwhile, twice where polls are all that feeds. Commands are not counted: they
+//! put a feeding off until two thirds of the time have passed, and no further.
 
 use serde::Serialize;
 
@@ -130,9 +130,10 @@ pub fn of_device(settings: &DeviceSettings, delays: Delays) -> Vec<Feeding> {
         let polled_every = asked_every + delays.one_request + delays.round;
         let [before, before_one_silent] =
             [delays.one_request, delays.one_silent].map(|delay| delay + delays.others_fed);
-        let every =
-            [polled_every.min(due + before), (polled_every + delays.one_silent).min(due + before_one_silent)];
-        let enough = (polled_every + delays.one_silent).min(before_one_silent * LONGER);
+        // Behind such a silence the others catch up with what they have missed, and may come twice.
+        let polled_one_silent = polled_every + delays.one_silent + delays.round;
+        let every = [polled_every.min(due + before), polled_one_silent.min(due + before_one_silent)];
+        let enough = polled_one_silent.min(before_one_silent * LONGER);
         // Nothing can be said where nothing is polled again and again and its time is not known.
         if every[0].is_finite() {
             all.push(Feeding::new(settings, point, "watchdog", time, every, enough, delays));
