@@ -13,7 +13,7 @@ use crate::edge::bus_thread::{BusHandle, Threads};
 use crate::edge::clock::Clock;
 use crate::edge::files;
 use crate::edge::http::Http;
-use crate::edge::mqtt::{Broker, Mailbox};
+use crate::edge::mqtt::{Broker, Deputy, Mailbox};
 use crate::edge::plant::Plant;
 use crate::edge::reports::{Detail, Reporter, Watched};
 use crate::edge::runtime::Runtime;
@@ -98,7 +98,7 @@ impl App {
         plant.set_buses(buses.clone());
 
         let _inside = runtime.enter();
-        let broker = connect(&plant, secrets, clock);
+        let broker = connect(&plant, secrets, clock, None);
         let of_reporter = plant.clone();
         let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched(&buses)));
         let http =
@@ -231,10 +231,10 @@ pub(super) fn end_buses(runtime: &Runtime, buses: Vec<Arc<BusHandle>>) {
 }
 
 /// Connects to the plant's broker. Only within a runtime.
-pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock) -> Broker {
+pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock, deputy: Option<Deputy>) -> Broker {
     let of_route = plant.clone();
     let route = move |news| of_route.tell(news);
-    let broker = Broker::start(&plant.settings(), secrets, clock, plant.mailbox(), route);
+    let broker = Broker::start(&plant.settings(), secrets, clock, plant.mailbox(), deputy, route);
     plant.set_connection(broker.state());
     broker
 }

@@ -125,7 +125,7 @@ impl App {
         self.plant.set_buses(buses.clone());
         self.keys = keys;
         let _inside = self.runtime.enter();
-        self.broker = Some(connect(&self.plant, secrets, self.clock));
+        self.broker = Some(connect(&self.plant, secrets, self.clock, None));
         self.reporter.replace(watched(&buses));
         Ok(())
     }
@@ -253,11 +253,16 @@ impl App {
     }
 
     fn reconnect(&mut self, secrets: Secrets) {
+        let mut deputy = None;
         if let Some(broker) = self.broker.take() {
+            let of_route = self.plant.clone();
+            let route = move |news| of_route.tell(news);
+            let settings = self.plant.settings();
+            deputy = self.runtime.block_on(broker.deputy(&settings.mqtt, secrets.clone(), route));
             self.runtime.block_on(broker.finish());
         }
         let _inside = self.runtime.enter();
-        self.broker = Some(connect(&self.plant, secrets, self.clock));
+        self.broker = Some(connect(&self.plant, secrets, self.clock, deputy));
     }
 
     fn exchange_http(&mut self, listener: Option<Bound>, listen: Option<&str>) -> anyhow::Result<()> {
