@@ -238,21 +238,23 @@ fn no_command_waits_longer_than_is_forecast_and_the_worst_one_as_long() {
     }
 }
 
+/// A relay module with a watchdog that is polled so often, and seven units that nearly fill the line.
+fn watched(poll: &str) -> String {
+    format!(
+        "buses:\n  line: {{serial: /dev/serial/by-id/usb-A, {W1}}}\ndevices:\n  \
+         relays: {{bus: line, unit: 1, profile: metz-connect/mr-do4, poll: {{fast: {poll}}}, settings: {{watchdog: 30s}}}}\n"
+    ) + &(2..=8)
+        .map(|unit| {
+            format!(
+                "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: 300ms}}, points: {{{}}}}}\n",
+                twenty(true, "fast")
+            )
+        })
+        .collect::<String>()
+}
+
 #[test]
 fn no_command_and_no_watchdog_waits_longer_than_is_forecast_when_a_unit_dies() {
-    let watched = |poll: &str| {
-        format!(
-            "buses:\n  line: {{serial: /dev/serial/by-id/usb-A, {W1}}}\ndevices:\n  \
-             relays: {{bus: line, unit: 1, profile: metz-connect/mr-do4, poll: {{fast: {poll}}}, settings: {{watchdog: 30s}}}}\n"
-        ) + &(2..=8)
-            .map(|unit| {
-                format!(
-                    "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: 300ms}}, points: {{{}}}}}\n",
-                    twenty(true, "fast")
-                )
-            })
-            .collect::<String>()
-    };
     for poll in ["250ms", "1s"] {
         let configuration = watched(poll);
         let forecast = check(&configuration, &[])["buses"][0].clone();
@@ -291,8 +293,7 @@ fn no_command_and_no_watchdog_waits_longer_than_is_forecast_when_a_unit_dies() {
                 worst = worst.max(wire.longest_wait(1));
             }
             wire.set_dead(5, false);
-            // A command's forecast is for a unit that is not known yet, which is waited for fully: it dies soon
-            // again. A watchdog's is for one that has been there for some time, with nothing to catch up.
+            // A command's forecast is for a unit that is not known yet, which is waited for fully: it dies soon again.
             wire.run_until(wire.now + Duration::from_secs(if number % 4 < 2 { 5 } else { 16 }));
         }
         assert!(calm <= fed && calm > 0.5 * fed, "{poll}: forecast {fed}, found {calm}");
@@ -305,6 +306,29 @@ fn no_command_and_no_watchdog_waits_longer_than_is_forecast_when_a_unit_dies() {
             "{poll}: forecast {command_wait}, found {worst_command}"
         );
     }
+}
+
+#[test]
+fn nor_does_a_watchdog_when_the_unit_dies_again_soon_after_its_return() {
+    let configuration = watched("1s");
+    let forecast = check(&configuration, &[])["buses"][0].clone();
+    let fed = forecast["devices"][0]["feeding"][0]["fed_every_one_silent"].as_f64().expect("a time");
+    let mut worst = 0.0_f64;
+    for life in [500, 1_000, 2_000, 8_000] {
+        let mut wire = Wire::new(&configuration, Duration::from_millis(5));
+        wire.run_until(Time::from_millis(20_000));
+        for number in 0..60 {
+            wire.set_dead(5, true);
+            wire.asked.clear();
+            let dead = [3_000, 6_000, 9_000, 30_000][number as usize % 4] + 131 * (number % 7);
+            wire.run_until(wire.now + Duration::from_millis(dead));
+            worst = worst.max(wire.longest_wait(1));
+            wire.set_dead(5, false);
+            wire.run_until(wire.now + Duration::from_millis(life + 37 * number));
+        }
+    }
+    // With a period less it would be too short.
+    assert!(worst <= fed && worst > fed - 1.0, "forecast {fed}, found {worst}");
 }
 
 #[test]
