@@ -314,6 +314,29 @@ fn no_command_waits_longer_than_is_forecast_when_a_unit_dies() {
 }
 
 #[test]
+fn nor_does_a_watchdog_when_the_unit_dies_again_soon_after_its_return() {
+    let configuration = watched("1s");
+    let forecast = check(&configuration, &[])["buses"][0].clone();
+    let fed = forecast["devices"][0]["feeding"][0]["fed_every_one_silent"].as_f64().expect("a time");
+    let mut worst = 0.0_f64;
+    for life in [500, 1_000, 2_000, 8_000] {
+        let mut wire = Wire::new(&configuration, Duration::from_millis(5));
+        wire.run_until(Time::from_millis(20_000));
+        for number in 0..60 {
+            wire.set_dead(5, true);
+            wire.asked.clear();
+            let dead = [3_000, 6_000, 9_000, 30_000][number as usize % 4] + 131 * (number % 7);
+            wire.run_until(wire.now + Duration::from_millis(dead));
+            worst = worst.max(wire.longest_wait(1));
+            wire.set_dead(5, false);
+            wire.run_until(wire.now + Duration::from_millis(life + 37 * number));
+        }
+    }
+    // With a period less it would be too short.
+    assert!(worst <= fed && worst > fed - 1.0, "forecast {fed}, found {worst}");
+}
+
+#[test]
 fn what_is_advised_is_enough() {
     let case = cases().into_iter().find(|case| case.what == "two classes, too slow").expect("a case");
     let text = case.configuration();

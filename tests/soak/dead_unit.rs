@@ -78,6 +78,25 @@ fn a_unit_that_returns_slower_than_it_went_is_heard_or_spoils_what_others_say_an
     }
 }
 
+#[test]
+fn on_a_calm_line_the_late_answer_of_a_unit_that_returns_slower_is_heard_and_it_is_back_soon() {
+    let (mut world, within) = (world_polled(2, "1s"), Duration::from_secs(5));
+    let dead = 2;
+    world.run_until(world.now + Duration::from_secs(5));
+    world.act(dead, &Action::Power { unit: dead, on: false });
+    world.run_until(world.now + GROWN);
+    world.act(dead, &Action::Power { unit: dead, on: true });
+    // Longer than a probe of it waits.
+    world.act(dead, &Action::Fault("unit=2,slow=200ms".parse().expect("a fault")));
+    let returned_at = world.now;
+    world.run_until(returned_at + within);
+    assert!(world.late_replies() > 0 && world.collisions == 0, "{} late", world.late_replies());
+    let topic = format!("busker/unit_{dead}/availability");
+    let last = world.published.iter().rev().find(|published| published.message.topic == topic);
+    let last = last.expect("it was told");
+    assert!(last.at >= returned_at && last.message.payload == "online", "{:?}", last.message);
+}
+
 /// The unit has been alive for so long, and its return is to be noticed within so long.
 #[track_caller]
 fn check(alive: Duration, noticed_within: Duration) {
@@ -135,16 +154,20 @@ fn power(world: &mut World, on: bool) {
 
 /// Units from 1 on, polled as fast as the line allows.
 fn world(units: u8) -> World {
+    world_polled(units, "1ms")
+}
+
+fn world_polled(units: u8, poll: &str) -> World {
     let turnaround = Duration::from_millis(5);
     let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
     for unit in 1..=units {
         let at = Place { unit, device: format!("unit_{unit}") };
         line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
     }
-    World::new(gateway(units), line)
+    World::new(gateway(units, poll), line)
 }
 
-fn gateway(units: u8) -> Settings {
+fn gateway(units: u8, poll: &str) -> Settings {
     let points: Vec<String> =
         (0..BLOCK).map(|address| format!("reading_{address}: {{at: input {address}, poll: fast}}")).collect();
     let mut text = String::from(
@@ -153,7 +176,7 @@ fn gateway(units: u8) -> Settings {
     for unit in 1..=units {
         let points = points.join(", ");
         text += &format!(
-            "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: 1ms}}, points: {{{points}}}}}\n"
+            "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: {poll}}}, points: {{{points}}}}}\n"
         );
     }
     match configuration::load("dead_unit.yaml", text.as_bytes(), &Library::shipped()) {

@@ -63,20 +63,20 @@ fn a_write_is_waited_for_fully_and_so_are_the_reads_behind_it() {
     assert_eq!(world.late_replies(), 0);
 }
 
+/// Without the rule that what is lost again and again while others are answered now and then goes first, it is 16 s
+/// and more here: [`busker::engine::schedule::Polls::try_again`].
 #[test]
 fn what_is_disturbed_in_step_with_the_polls_starves_no_reading() {
-    for units in [1, 4] {
-        for every in 2..=8 {
-            for poll in ["1ms", "200ms"] {
-                let mut world = world(units, poll);
-                world.run_until(world.now + KNOWN);
-                fault(&mut world, 1, &format!("silent,every={every}"));
-                let from = world.now;
-                world.run_until(from + Duration::from_secs(60));
-                let longest = without_news(&world, from);
-                let what = format!("{units} units, every {every}th request, each {poll}");
-                assert!(longest < Duration::from_secs(8), "{what}: {longest:?}");
-            }
+    for (units, poll) in [(1, "1ms"), (1, "50ms"), (1, "200ms"), (2, "50ms"), (4, "1ms"), (4, "200ms")] {
+        for every in 2..=12 {
+            let mut world = world(units, poll);
+            world.run_until(world.now + KNOWN);
+            fault(&mut world, 1, &format!("silent,every={every}"));
+            let from = world.now;
+            world.run_until(from + Duration::from_secs(60));
+            let longest = without_news(&world, from);
+            let what = format!("{units} units, every {every}th request, each {poll}");
+            assert!(longest < Duration::from_secs(5), "{what}: {longest:?}");
         }
     }
 }
