@@ -6,6 +6,7 @@ use rustix::event::{PollFd, PollFlags, poll};
 
 use crate::edge::bell::Bell;
 use crate::edge::clock::Clock;
+use crate::edge::expectation::Expectation;
 use crate::edge::link::{Link, Lost, timespec};
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Reply, Request, RequestError};
@@ -23,11 +24,14 @@ pub struct GuardedLink {
     not_before: Option<Time>,
     /// When what is there to be read came, if that is known to be earlier than now.
     came_at: Option<Time>,
+    /// Of a line; a thread for connections waits for many replies at a time.
+    expectation: Option<Expectation>,
 }
 
 impl GuardedLink {
     pub fn new(link: Link, guard: Guard, clock: Clock) -> GuardedLink {
-        GuardedLink { link, guard, clock, not_before: None, came_at: None }
+        let expectation = matches!(guard, Guard::Rtu(_)).then(Expectation::default);
+        GuardedLink { link, guard, clock, not_before: None, came_at: None, expectation }
     }
 
     /// Takes a request; it is sent now or by [`GuardedLink::advance`] when its time has come. A reply at
@@ -66,6 +70,11 @@ impl GuardedLink {
         self.not_before.map(|time| time.max(self.guard.earliest_send(self.clock.now())))
     }
 
+    /// When the reply to the request on the wire is likely to come, where that is known.
+    pub fn reply_expected_at(&self) -> Option<Time> {
+        self.expectation.as_ref().filter(|_| self.not_before.is_none())?.at()
+    }
+
     /// What is there to be read came by this time at the latest.
     pub fn woken_by(&mut self, time: Time) {
         self.came_at = Some(time);
@@ -82,6 +91,9 @@ impl GuardedLink {
             tape.heard(time, &buffer[..count]);
             let reply = self.guard.received(time, &buffer[..count]);
             if reply.is_some() {
+                if let Some(expectation) = &mut self.expectation {
+                    expectation.answered(time);
+                }
                 return usable(reply);
             }
         }
@@ -96,6 +108,9 @@ impl GuardedLink {
                 let sent_at = self.clock.now();
                 self.link.write(self.guard.frame())?;
                 self.guard.sent(sent_at);
+                if let Some(expectation) = &mut self.expectation {
+                    expectation.asked(self.guard.frame(), sent_at);
+                }
                 tape.sent(sent_at, self.guard.frame());
                 Ok(None)
             }

@@ -5,6 +5,7 @@ pub mod bell;
 pub mod bus_runner;
 pub mod bus_thread;
 pub mod clock;
+pub mod expectation;
 pub mod files;
 pub mod guarded_link;
 pub mod http;

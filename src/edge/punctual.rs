@@ -48,10 +48,15 @@ impl Punctual {
         self.rested_at = Some(now);
     }
 
+    /// Whether the bus has time to spare at `at`, so that nobody would gain by being punctual.
+    pub fn is_calm(&self, at: Time) -> bool {
+        self.rested_at.is_some_and(|rested_at| at.since(rested_at) < RESTED_LATELY)
+    }
+
     /// When to end a sleep so as to be awake at `at`; the rest is to be spun. `at` itself where nobody
     /// would gain by it.
     pub fn sleep_until(&self, at: Time) -> Time {
-        if self.rested_at.is_some_and(|rested_at| at.since(rested_at) < RESTED_LATELY) {
+        if self.is_calm(at) {
             return at;
         }
         let mut lags = self.lags;
