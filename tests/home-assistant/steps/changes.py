@@ -96,6 +96,7 @@ def a_neighbour_stays(house: House) -> None:
     is_left_alone("at first")
     for when in ("after a restart", "after the removal of a device", "after a restart without it", "with it again"):
         house.gateway.stop()
+        house.home.wait({AI8 + "_channel_1_code": {"state": "unavailable"}})
         if when == "after the removal of a device":
             house.gateway.devices.remove(relays)
         if when == "with it again":
