@@ -106,12 +106,15 @@ impl App {
             Some(state) => {
                 self.state.finish();
                 self.state = Arc::new(state);
-                self.watch.abort();
-                let _inside = self.runtime.enter();
-                let watch = watch(self.reporter.clone(), self.plant.clone(), self.state.clone());
-                self.watch = tokio::spawn(watch);
             }
             None => drop(self.state.learn(settings.devices.iter().map(|device| device.name.as_str()))),
+        }
+        // What it has told has been taken back.
+        self.watch.abort();
+        {
+            let _inside = self.runtime.enter();
+            let watch = watch(self.reporter.clone(), self.plant.clone(), self.state.clone());
+            self.watch = tokio::spawn(watch);
         }
         let everyone = 0..settings.buses.len();
         let wanted = reload::topics_of_devices(&settings);

@@ -53,8 +53,20 @@ class Announced:
             "entity_id": self.component.get("default_entity_id"),
             "device_class": self.component.get("device_class"),
             "category": self.component.get("entity_category"),
+            # One that is called as its device has no name of its own.
+            "name": self.component["name"],
         }
         return {key: value for key, value in facts.items() if value is not None or key != "entity_id"}
+
+    def kept_facts(self, fresh: bool) -> dict:
+        """What it is once it is enabled, be it available or not. When the digits of one that is there change, Home
+        Assistant takes notice only at its next start."""
+        facts = {key: self.component[key] for key in ("state_class", "options") if key in self.component}
+        if fresh and "suggested_display_precision" in self.component:
+            facts["precision"] = self.component["suggested_display_precision"]
+        if self.platform == "number" and not self.is_converted():
+            facts |= {"min": self.component["min"], "max": self.component["max"]}
+        return facts
 
     def state_facts(self) -> dict:
         """What a user should see of it."""

@@ -41,11 +41,37 @@ class Broker:
         if forget:
             self.memory.unlink(missing_ok=True)
 
+    def remember(self) -> None:
+        """Writes down what it keeps, as it does now and then."""
+        self.memory.unlink(missing_ok=True)
+        self.process.send_signal(signal.SIGUSR1)
+        deadline = time.monotonic() + PATIENCE
+        while not self.memory.exists():
+            if time.monotonic() > deadline:
+                raise Fault("the broker does not write down what it keeps")
+            time.sleep(0.02)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(PATIENCE)
+
+    def publish(self, messages: dict[str, str]) -> None:
+        """As somebody else, retained; an empty text takes a message back."""
+        with self.listening(["test/marker"]) as ears:
+            for topic, payload in messages.items():
+                ears.client.publish(topic, payload, 1, retain=True)
+            ears.client.publish("test/marker", "published", 1)
+            ears.wait_for(lambda _, payload: payload == "published", "the end of what was published")
+
     def retained(self, names: list[str]) -> dict[str, str]:
         """What the broker holds of discovery and of the devices of these names.
 
         Asked for in parts, as a mosquitto drops what it would have to queue beyond a thousand messages.
         """
+        return self.retained_below("homeassistant/#", *(f"busker/{name}/#" for name in ["bridge", *names]))
+
+    def retained_below(self, *parts: str) -> dict[str, str]:
+        """What the broker holds that fits one of these filters."""
         found = {}
 
         def receive(message) -> None:
@@ -53,7 +79,7 @@ class Broker:
                 found[message.topic] = message.payload.decode()
 
         with self.listening(["test/marker"], receive) as ears:
-            for part in ["homeassistant/#", *(f"busker/{name}/#" for name in ["bridge", *names])]:
+            for part in parts:
                 ears.client.subscribe(part, 1)
                 # It has all been sent when a message of our own comes back.
                 ears.client.publish("test/marker", part, 1)

@@ -15,17 +15,17 @@ OWN_PROFILES = pathlib.Path(__file__).parent / "profiles"
 class Busker:
     """The built program, and what it knows of profiles."""
 
-    def __init__(self, program: str) -> None:
-        self.program = program
+    def __init__(self, program: str, own_profiles: pathlib.Path = OWN_PROFILES) -> None:
+        self.program, self.own_profiles = program, own_profiles
 
     def tell(self, *arguments: str) -> str:
         return subprocess.run([self.program, *arguments], check=True, stdout=subprocess.PIPE, text=True).stdout
 
     def profiles(self) -> list[dict]:
-        return json.loads(self.tell("profiles", "list", "--profiles", str(OWN_PROFILES), "--json"))
+        return json.loads(self.tell("profiles", "list", "--profiles", str(self.own_profiles), "--json"))
 
     def profile(self, profile: str) -> dict:
-        return json.loads(self.tell("profiles", "show", "--profiles", str(OWN_PROFILES), profile, "--json"))
+        return json.loads(self.tell("profiles", "show", "--profiles", str(self.own_profiles), profile, "--json"))
 
     def simulated(self) -> list[str]:
         """The models that there is a simulator for."""
@@ -47,7 +47,7 @@ class Gateway:
         buses = {device.line.name: device.line.bus for device in self.devices}
         settings = {
             "http": {"listen": None},
-            "profiles": [str(OWN_PROFILES)],
+            "profiles": [str(self.busker.own_profiles)],
             "state_dir": f"{self.folder}/state",
             **self.wishes,
             "mqtt": {"url": f"mqtt://127.0.0.1:{self.broker.port}", **self.wishes.get("mqtt", {})},

@@ -10,7 +10,7 @@ from announced import Announced, announced
 from broker import Broker, broker_version
 from calls import IS_NOT_KEPT, Call, as_it_was, in_turns
 from fault import PATIENCE, Fault, same
-from gateway import Busker, Gateway
+from gateway import OWN_PROFILES, Busker, Gateway
 from home import Home
 from plant import Device, plant
 from report import Report
@@ -34,21 +34,27 @@ BROKER_IS_AWAY = re.compile(
 CLEARS_TWICE = re.compile(r"WARNING homeassistant\.components\.mqtt\.discovery: No device components to cleanup for .*")
 
 # On a machine with too much to do Home Assistant may complain of its own slowness.
-IS_SLOW = re.compile(r".* took \d+\.\d+ seconds\. Please create a bug report .*|.* is taking over \d+ seconds\.")
+IS_SLOW = re.compile(
+    r".* took \d+\.\d+ seconds\. Please create a bug report .*|.* is taking over \d+ seconds\."
+    r"|.*mqtt\.client: No ACK from MQTT server in 10 seconds .*"
+)
 
 
 class House:
-    """All that runs, and what was seen of it."""
+    """All that runs, and what was seen of it. `knows_all`: busker is told how new Home Assistant is."""
 
-    def __init__(self, program: str, version: str, folder: pathlib.Path, ending: contextlib.ExitStack, planted=plant) -> None:
+    def __init__(
+        self, program: str, version: str, folder: pathlib.Path, ending: contextlib.ExitStack, planted=plant,
+        own_profiles: pathlib.Path = OWN_PROFILES, knows_all: bool = False,
+    ) -> None:
         self.program, self.version, self.folder = program, version, folder
-        self.busker = Busker(program)
+        self.busker = Busker(program, own_profiles)
         self.devices = planted(self.busker, folder, ending)
         self.by_identity = {device.identity: device for device in self.devices}
         self.broker = Broker(folder, ending)
         # In minutes the test writes what a house writes in years.
         wishes = {"eeprom": {"interval": "0s", "daily": 10000}}
-        if version != NEWEST:
+        if version != NEWEST or knows_all:
             wishes["home_assistant"] = {"minimum_version": version}
         self.gateway = Gateway(self.busker, folder, self.broker, self.devices, ending, wishes)
         self.home = Home(folder / "home-assistant", self.broker.port, ending)
@@ -66,6 +72,17 @@ class House:
         if self.witness is not None:
             return announced(dict(self.witness))
         return announced(self.broker.retained([device.name for device in self.devices]))
+
+    def announced_in_the_end(self, identity: str) -> dict[str, Announced]:
+        """All that is announced when this device is, and is available."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            now = self.announced()
+            of_device = [one for one in now.values() if one.identity == identity]
+            if of_device and all(one.is_available and one.is_told() for one in of_device):
+                return now
+            time.sleep(0.1)
+        raise Fault(f"{identity} was not announced with all its states")
 
     def settle(self, fresh: bool = False, patience: float = PATIENCE) -> dict[str, Announced]:
         """Waits until Home Assistant has exactly what is announced, and shows what the broker holds;
@@ -114,8 +131,9 @@ class House:
             wanted[key] = one.identity_facts() | {"enabled": is_enabled}
             if key in self.own_ids:
                 wanted[key]["entity_id"] = self.own_ids[key]
+                del wanted[key]["name"]
             if is_enabled:
-                wanted[key] |= one.state_facts()
+                wanted[key] |= one.kept_facts(fresh) | one.state_facts()
         return wanted
 
     def is_asked_for(self, one: Announced) -> bool:

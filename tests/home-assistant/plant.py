@@ -13,54 +13,7 @@ import subprocess
 import threading
 
 from fault import PATIENCE, Fault
-from gateway import OWN_PROFILES, Busker
-
-
-def plant(busker: Busker, folder: pathlib.Path, ending: contextlib.ExitStack) -> list[Device]:
-    """A device of every profile that has a simulator, and of the test's own, dealt out to three lines."""
-    simulated = set(busker.simulated())
-    profiles = [about for about in busker.profiles() if about["device"] in simulated or is_own(about)]
-    ways_in = {"cellar": "pty", "attic": "rtu_over_tcp", "hall": "tcp"}
-    devices = []
-    for number, (name, way_in) in enumerate(ways_in.items()):
-        devices += connected(profiles[number :: len(ways_in)], name, way_in, folder, busker, ending)
-    return sorted(devices, key=lambda device: device.profile)
-
-
-def large_plant(busker: Busker, folder: pathlib.Path, ending: contextlib.ExitStack) -> list[Device]:
-    """Devices with 3,000 points and more, on four Modbus TCP connections."""
-    simulated = set(busker.simulated())
-    profiles = [about for about in busker.profiles() if about["device"] in simulated]
-    kinds = [(about, len(busker.profile(about["device"])["points"])) for about in profiles]
-    lines = {name: [] for name in ("north", "east", "south", "west")}
-    points = 0
-    while points < 3000:
-        for about, count in kinds:
-            min(lines.values(), key=len).append(about)
-            points += count
-    devices = []
-    for name, abouts in lines.items():
-        for device in connected(abouts, name, "tcp", folder, busker, ending):
-            # There are several of each profile.
-            device.name = f"{name}_{device.unit}_{device.name}"
-            device.title = f"{device.title} {name} {device.unit}"
-            device.identity = f"busker_{device.name}"
-            devices.append(device)
-    return devices
-
-
-def connected(abouts: list[dict], name: str, way_in: str, folder: pathlib.Path, busker: Busker, ending) -> list[Device]:
-    """Devices of these profiles on one line, with units from 1 on."""
-    units = []
-    for unit, about in enumerate(abouts, 1):
-        path = f"{OWN_PROFILES}/{about['device']}.yaml"
-        units += ["--profile", f"{path}@{unit}"] if is_own(about) else [f"{about['device']}@{unit}"]
-    line = Line(name, way_in, units, folder, busker, ending)
-    return [Device(about, busker.profile(about["device"]), line, unit) for unit, about in enumerate(abouts, 1)]
-
-
-def is_own(about: dict) -> bool:
-    return (OWN_PROFILES / f"{about['device']}.yaml").exists()
+from gateway import Busker
 
 
 class Device:
@@ -140,3 +93,50 @@ class Line:
         if answered != function:
             raise Fault(f"unit {unit} on {self.name} answered {answered:#x} {answer.hex()} to {function} {body.hex()}")
         return answer
+
+
+def plant(busker: Busker, folder: pathlib.Path, ending: contextlib.ExitStack) -> list[Device]:
+    """A device of every profile that has a simulator, and of the test's own, dealt out to three lines."""
+    simulated = set(busker.simulated())
+    profiles = [about for about in busker.profiles() if about["device"] in simulated or is_own(busker, about)]
+    ways_in = {"cellar": "pty", "attic": "rtu_over_tcp", "hall": "tcp"}
+    devices = []
+    for number, (name, way_in) in enumerate(ways_in.items()):
+        devices += connected(profiles[number :: len(ways_in)], name, way_in, folder, busker, ending)
+    return sorted(devices, key=lambda device: device.profile)
+
+
+def large_plant(busker: Busker, folder: pathlib.Path, ending: contextlib.ExitStack) -> list[Device]:
+    """Devices with 3,000 points and more, on four Modbus TCP connections."""
+    simulated = set(busker.simulated())
+    profiles = [about for about in busker.profiles() if about["device"] in simulated]
+    kinds = [(about, len(busker.profile(about["device"])["points"])) for about in profiles]
+    lines = {name: [] for name in ("north", "east", "south", "west")}
+    points = 0
+    while points < 3000:
+        for about, count in kinds:
+            min(lines.values(), key=len).append(about)
+            points += count
+    devices = []
+    for name, abouts in lines.items():
+        for device in connected(abouts, name, "tcp", folder, busker, ending):
+            # There are several of each profile.
+            device.name = f"{name}_{device.unit}_{device.name}"
+            device.title = f"{device.title} {name} {device.unit}"
+            device.identity = f"busker_{device.name}"
+            devices.append(device)
+    return devices
+
+
+def connected(abouts: list[dict], name: str, way_in: str, folder: pathlib.Path, busker: Busker, ending) -> list[Device]:
+    """Devices of these profiles on one line, with units from 1 on."""
+    units = []
+    for unit, about in enumerate(abouts, 1):
+        path = busker.own_profiles / f"{about['device']}.yaml"
+        units += ["--profile", f"{path}@{unit}"] if is_own(busker, about) else [f"{about['device']}@{unit}"]
+    line = Line(name, way_in, units, folder, busker, ending)
+    return [Device(about, busker.profile(about["device"]), line, unit) for unit, about in enumerate(abouts, 1)]
+
+
+def is_own(busker: Busker, about: dict) -> bool:
+    return (busker.own_profiles / f"{about['device']}.yaml").exists()

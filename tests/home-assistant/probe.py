@@ -17,6 +17,8 @@ standard input is a command with a `do`; each gets one line of answer on standar
                                           comes after that comes enabled, so that nothing has to be set up anew
     {"do": "personalize", "entity": ID, "name": NAME, "entity_id": ENTITY_ID}
                                           as a user gives an entity his own name and id
+    {"do": "services"}                    the services of each domain that the MQTT entities have
+    {"do": "classes"}                     Home Assistant's own tables of device classes, units and state classes
     {"do": "log"}                         what was logged as a warning or worse, and open repair issues
     {"do": "quit"}
 """
@@ -30,7 +32,10 @@ import pathlib
 import sys
 
 from homeassistant import bootstrap, config_entries, core, loader, runner
+from homeassistant.components import binary_sensor, switch
 from homeassistant.components.mqtt import client as mqtt_client, entity as mqtt_entity
+from homeassistant.components.number import const as number_platform
+from homeassistant.components.sensor import const as sensor
 from homeassistant.const import EVENT_STATE_CHANGED, __version__
 from homeassistant.helpers import device_registry, entity_registry, issue_registry
 
@@ -171,6 +176,22 @@ class Probe:
         entity_registry.async_get(self.hass).async_update_entity(
             entry.entity_id, name=command["name"], new_entity_id=command["entity_id"]
         )
+
+    async def services(self, _: dict) -> dict:
+        known = self.hass.services.async_services()
+        return {domain: sorted(known.get(domain, {})) for domain in {entry.domain for entry in self.registered().values()}}
+
+    async def classes(self, _: dict) -> dict:
+        def texts(table) -> dict:
+            return {str(key): sorted(str(one) for one in several if one is not None) for key, several in table.items()}
+
+        return {
+            "sensor": texts(sensor.DEVICE_CLASS_UNITS),
+            "number": texts(number_platform.DEVICE_CLASS_UNITS),
+            "states": texts(sensor.DEVICE_CLASS_STATE_CLASSES),
+            "binary_sensor": [str(one) for one in binary_sensor.BinarySensorDeviceClass],
+            "switch": [str(one) for one in switch.SwitchDeviceClass],
+        }
 
     async def log(self, _: dict) -> list[str]:
         issues = issue_registry.async_get(self.hass).issues.values()

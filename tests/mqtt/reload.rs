@@ -94,8 +94,13 @@ const DONE: &str = "what has changed is at work";
 
 #[track_caller]
 fn online(watcher: &Watcher, devices: &[&str]) {
+    online_at(watcher, "busker", devices);
+}
+
+#[track_caller]
+fn online_at(watcher: &Watcher, base: &str, devices: &[&str]) {
     for device in devices {
-        watcher.wait_for(&format!("busker/{device}/availability"), "online");
+        watcher.wait_for(&format!("{base}/{device}/availability"), "online");
     }
 }
 
@@ -232,6 +237,23 @@ fn everything_begins_anew_also_after_a_long_calm() {
     gateway.write(&before.replace("mqtt: {", "mqtt: {base_topic: house, "));
     gateway.reload(DONE);
     watcher.wait_for("house/relays/availability", "online");
+
+    // All is told again, also where it stands as before, and what is told each minute.
+    watcher.wait_until("the health", |got| got.topic == "house/relays/health");
+    let anew =
+        before.replace("mqtt: {", "home_assistant: {minimum_version: '2025.4'}\nmqtt: {base_topic: house, ");
+    gateway.write(&anew);
+    watcher.forget();
+    gateway.reload(DONE);
+    online_at(&watcher, "house", &["relays", "pump"]);
+    let clock = Clock::start();
+    let since = clock.now();
+    watcher.wait_until("the health once more", |got| {
+        got.topic == "house/relays/health" && !got.payload.is_empty()
+    });
+    // Not only when the next minute begins.
+    let after = clock.now() - since;
+    assert!(after < Duration::from_secs(30), "{after:?}");
     assert!(gateway.terminate().success());
 }
 

@@ -175,6 +175,30 @@ fn what_is_only_shown_and_read_again_and_again_expires_where_that_is_wished() {
 }
 
 #[test]
+fn ids_are_the_same_under_another_name_address_bus_or_order() {
+    let ids = |announcement: Announcement| {
+        let payload = payload(&announcement.message());
+        let components = payload["components"].as_object().expect("an object").iter();
+        let mut ids: Vec<(String, Value, Value)> = components
+            .map(|(key, one)| (key.clone(), one["unique_id"].clone(), one["default_entity_id"].clone()))
+            .collect();
+        ids.sort_by(|one, other| one.0.cmp(&other.0));
+        (announcement.topic().to_string(), payload["device"]["identifiers"].clone(), ids)
+    };
+    let mut moved = device();
+    (moved.title, moved.unit, moved.bus) = ("Boiler room".into(), 77, 3);
+    let mut inner = (*moved.device).clone();
+    // The mode, by which the input is understood, stays in the middle.
+    inner.points.reverse();
+    for point in &mut inner.points {
+        point.presentation.name = Some(format!("Another {}", point.name));
+    }
+    moved.device = inner.into();
+    let known = [None, Some(0), None];
+    assert_eq!(ids(announcement(&gateway(), &moved, "attic", &known)), ids(announced(Some(0))));
+}
+
+#[test]
 fn how_a_device_is_on_its_wire_is_told_by_few_entities_and_by_more_that_can_be_enabled() {
     let told = payload(&announced(None).message());
     let components = told["components"].as_object().expect("an object");

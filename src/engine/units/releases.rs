@@ -39,7 +39,9 @@ pub fn known_since(class: &str, unit: Option<&str>) -> Release {
 /// The unit as this release spells it: from 2025.10 on with the Greek letter for micro, before with the
 /// sign of that name.
 pub fn spelt_for(unit: &str, release: Release) -> String {
-    if release < GREEK_MICRO { unit.replace('\u{3bc}', "\u{b5}") } else { normalized(unit) }
+    // Microseconds had it always.
+    let was_greek = normalized(unit) == "\u{3bc}s";
+    if release < GREEK_MICRO && !was_greek { unit.replace('\u{3bc}', "\u{b5}") } else { normalized(unit) }
 }
 
 const fn release(year: u16, month: u8) -> Release {
@@ -132,6 +134,7 @@ mod tests {
     fn micro_is_spelt_as_the_release_does() {
         assert_eq!(spelt_for("\u{3bc}g/m³", Release { year: 2025, month: 4 }), "\u{b5}g/m³");
         assert_eq!(spelt_for("\u{b5}g/m³", Release { year: 2025, month: 10 }), "\u{3bc}g/m³");
+        assert_eq!(spelt_for("\u{b5}s", Release { year: 2025, month: 4 }), "\u{3bc}s");
         assert_eq!(spelt_for("°C", Release { year: 2025, month: 4 }), "°C");
     }
 }

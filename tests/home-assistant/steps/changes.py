@@ -1,5 +1,6 @@
 """The configuration or a device changes, whoever is there to notice."""
 
+import json
 import time
 
 from fault import PATIENCE, same
@@ -63,6 +64,58 @@ def nobody_is_gone(house: House) -> None:
         "a mode changes at the device, and another device is taken out of the configuration, while busker is stopped and "
         "Home Assistant starts anew",
         "entities of the old mode, the removed device and its entities are gone; put back, it has its ids again",
+    )
+
+
+def a_neighbour_stays(house: House) -> None:
+    """What others have announced, some of it much like ours, is left alone, whatever happens to busker."""
+    about = {"device": {"identifiers": ["busker_old_relays"], "name": "Neighbour"}, "origin": {"name": "zigbee2mqtt"}}
+    sensor = {"platform": "sensor", "unique_id": "busker_old_relays_sum", "state_topic": "homeassistant/neighbour"}
+    single = {"unique_id": "neighbour_single", "name": "Single", "state_topic": "homeassistant/neighbour", "platform": "mqtt"}
+    other = {"device": {"identifiers": ["busker_2_relays"], "name": "Another busker"}, "origin": {"name": "busker"},
+             "availability": [{"topic": "busker_2/bridge/state"}],
+             "components": {"sum": sensor | {"unique_id": "busker_2_relays_sum", "state_topic": "busker_2/relays/sum"}}}
+    theirs = {
+        "homeassistant/device/busker_old_relays/config": json.dumps(about | {"components": {"sum": sensor}}),
+        "homeassistant/sensor/busker_test_valve/config": json.dumps(single),
+        "homeassistant/device/busker_2_relays/config": json.dumps(other),
+        "homeassistant/neighbour": "42",
+        "busker_2/bridge/state": "online",
+        "busker_2/relays/sum": "43",
+    }
+    shown = {"busker_old_relays_sum": {"state": "42"}, "neighbour_single": {"state": "42"}, "busker_2_relays_sum": {"state": "43"}}
+
+    def is_left_alone(when: str) -> None:
+        kept = house.broker.retained([]) | house.broker.retained_below("busker_2/#")
+        same({topic: kept.get(topic) for topic in theirs}, theirs, f"what the neighbours have at the broker {when}")
+        house.home.wait(shown)
+        house.log_is_empty()
+
+    relays = house.device(DO4)
+    house.broker.publish(theirs)
+    is_left_alone("at first")
+    for when in ("after a restart", "after the removal of a device", "after a restart without it", "with it again"):
+        house.gateway.stop()
+        house.home.wait({AI8 + "_channel_1_code": {"state": "unavailable"}})
+        if when == "after the removal of a device":
+            house.gateway.devices.remove(relays)
+        if when == "with it again":
+            house.gateway.devices.append(relays)
+        house.gateway.start()
+        house.home.wait({DO4 + "_relay_1": {"exists": relays in house.gateway.devices},
+                         AI8 + "_channel_1_code": {"known": True}})
+        is_left_alone(when)
+    house.home.stop()
+    house.home.start()
+    is_left_alone("after a restart of Home Assistant")
+    house.broker.publish({topic: "" for topic in theirs})
+    house.home.wait({key: {"exists": False} for key in shown})
+    house.settle()
+    house.log_is_empty()
+    house.report.row(
+        "others announce devices: one of another origin with a name as ours have, a single entity, and another busker's; busker is "
+        "restarted, with a device less, and with it again, and Home Assistant is",
+        "what the others have at the broker is byte for byte as it was, and their entities show their states",
     )
 
 

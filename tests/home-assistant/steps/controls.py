@@ -8,7 +8,7 @@ from announced import Announced
 from calls import IS_NOT_KEPT, Call, as_it_was
 from fault import same
 from house import House
-from steps.devices import AI8, DO4, RELAY8, SI4
+from steps.devices import AI8, DIO42, DO4, RELAY8, SI4, VALVE
 
 # The controller writes it itself, all the time (manual, page 70).
 MOVES_ITSELF = re.compile(r"busker_metz_connect_mr_aio42_controller_\d_output")
@@ -144,6 +144,69 @@ def other_option(one: Announced, now: str | None, point: dict) -> Call:
 def other_text(one: Announced, now: str | None, point: dict) -> Call:
     some = ("R017", "A255") if point["type"] == "letter_number" else ("12", "13")
     return as_it_was(one, some[now == some[0]])
+
+
+# What stands for more than busker's entities can do: positions, tilts, presets and ranges.
+NOT_OFFERED = re.compile(
+    r"cover\.(set_cover_position|\w*tilt\w*)|valve\.set_valve_position"
+    r"|climate\.set_(aux_heat|fan_mode|humidity|preset_mode|swing_mode|swing_horizontal_mode)"
+    r"|(sensor|binary_sensor|event)\.\w+|\w+\.reload"
+)
+
+
+def every_service(house: House) -> None:
+    """Every service that Home Assistant has for these platforms, also those that few people know."""
+    found = house.settle()
+    order, valve, cover = RELAY8 + "_relay_6_order", VALVE + "_valve", DIO42 + "_channel_2_damper"
+    options = found[order].component["options"]
+    climate, text = (next(key for key, one in found.items() if one.platform == platform) for platform in ("climate", "text"))
+    runs = next(mode for mode in found[climate].component["modes"] if mode != "off")
+    texts = house.device(found[text].identity).points[found[text].point()]
+    new_text = other_text(found[text], found[text].payload(), texts).data
+    # A service with its data, and the state that it leads to; those of one entity stand one behind the other.
+    calls = [
+        (DO4 + "_relay_3", "switch.turn_on", {}, "on"),
+        (DO4 + "_relay_3", "switch.toggle", {}, "off"),
+        (DO4 + "_relay_3", "switch.toggle", {}, "on"),
+        (DO4 + "_relay_3", "switch.turn_off", {}, "off"),
+        (DO4 + "_watchdog", "number.set_value", {"value": 0.5}, "0.5"),
+        (DO4 + "_watchdog", "number.set_value", {"value": 0}, "0.0"),
+        (order, "select.select_first", {}, options[0]),
+        (order, "select.select_next", {}, options[1]),
+        (order, "select.select_last", {}, options[-1]),
+        (order, "select.select_next", {}, options[0]),
+        (order, "select.select_previous", {}, options[-1]),
+        (order, "select.select_option", {"option": "automatic"}, "automatic"),
+        (text, "text.set_value", new_text, new_text["value"]),
+        (RELAY8 + "_restart", "button.press", {}, None),
+        (climate, "climate.turn_off", {}, "off"),
+        (climate, "climate.turn_on", {}, runs),
+        (climate, "climate.toggle", {}, "off"),
+        (climate, "climate.set_temperature", {"temperature": 22.5, "hvac_mode": runs}, runs),
+        (climate, "climate.set_hvac_mode", {"hvac_mode": "off"}, "off"),
+        (valve, "valve.toggle", {}, None),
+        (valve, "valve.stop_valve", {}, None),
+        (valve, "valve.open_valve", {}, None),
+        (valve, "valve.close_valve", {}, None),
+        (cover, "cover.toggle", {}, None),
+        (cover, "cover.open_cover", {}, None),
+        (cover, "cover.close_cover", {}, None),
+    ]
+    for key, service, data, state in calls:
+        wanted = {} if state is None else {"state": state}
+        if "temperature" in data:
+            wanted["temperature"] = data["temperature"]
+        house.act([Call(house.announced()[key], service, data, wanted)])
+    offered = {f"{domain}.{name}" for domain, several in house.home.ask("services").items() for name in several}
+    missing = {name for name in offered - {service for _, service, _, _ in calls} if not NOT_OFFERED.fullmatch(name)}
+    same(missing - {"cover.stop_cover"}, set(), "the services that were not called")
+    same(house.device(DO4).read("coil", 2), [0], "the coil of the relay")
+    house.settle()
+    house.log_is_empty()
+    house.report.row(
+        "every service of the platforms, such as `select.select_previous`, `climate.toggle` or a temperature together with a mode",
+        f"{len({service for _, service, _, _ in calls})} services, {len(calls)} calls: each ends as `done`, and the state is what it should be",
+    )
 
 
 def every_button(house: House) -> None:

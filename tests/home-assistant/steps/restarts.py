@@ -40,6 +40,45 @@ def restarts(house: House) -> None:
     )
 
 
+def the_broker_returns_alone(house: House) -> None:
+    """Broker and gateway end in the same moment, and only the broker comes back, with all that it kept."""
+    usual, house.gateway.wishes = house.gateway.wishes, house.gateway.wishes | {
+        "republish": "2s", "home_assistant": house.gateway.wishes.get("home_assistant", {}) | {"expire_after": "6s"}
+    }
+    house.gateway.reload()
+    # Nothing expires that is polled, and told again in time.
+    time.sleep(8)
+    found = house.settle()
+    before = states(house)
+    house.broker.remember()
+    # Who would tell the last will is the first to end.
+    house.broker.kill()
+    house.gateway.kill()
+    house.broker.start()
+    same(house.broker.retained([])["busker/bridge/state"], "online", "what the broker goes on telling")
+    seen = house.home.ask("entities")
+    expires = {key: one.component.get("expire_after") for key, one in found.items() if seen[key]["enabled"]}
+    soon = {key for key, seconds in expires.items() if seconds and seconds <= 6}
+    # Home Assistant finds the broker again, and believes it.
+    house.home.wait({key: {"state": state} for key, state in before.items()})
+    house.home.wait({key: {"state": "unavailable"} for key in soon})
+    same(states(house), before, "the controls, which do not expire")
+    house.gateway.start()
+    house.settle()
+    house.log_is_empty()
+    house.gateway.wishes = usual
+    house.gateway.reload()
+    house.settle()
+    house.log_is_empty()
+    house.report.row(
+        "`republish: 2s, home_assistant: {expire_after: 6s}`; the broker and busker are killed in the same moment, and only the "
+        "broker comes back, which goes on telling `online`",
+        f"before, nothing expires; then {len(soon)} sensors and binary sensors of quick polls become unavailable within seconds, "
+        f"{sum(bool(seconds) for seconds in expires.values()) - len(soon)} of slower ones would later; when busker is "
+        "there again all have their states",
+    )
+
+
 def other_topics(house: House) -> None:
     """Values stand elsewhere, are not kept by the broker, and come in one message for each device, too."""
     relays = house.device(DO4)
