@@ -191,7 +191,8 @@ impl BusRunner {
         if is_links_turn {
             self.advance_port();
         }
-        if self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
+        // What came has told the bus the time. (If it was nothing whole, the thread asks again when to go on.)
+        if !bytes && self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
             self.handle(Event::Wake);
         }
         self.perform();

@@ -55,7 +55,7 @@ impl GuardedLink {
         }
         match &self.guard {
             // What is still to be read belongs to older transactions, and says so.
-            Guard::Tcp(_) => self.send_or_wake(tape),
+            Guard::Tcp(_) => self.send_or_wake(now, tape),
             Guard::Rtu(_) => self.advance(tape),
         }
     }
@@ -97,21 +97,19 @@ impl GuardedLink {
                 return usable(reply);
             }
         }
-        self.send_or_wake(tape)
+        self.send_or_wake(self.clock.now(), tape)
     }
 
-    fn send_or_wake(&mut self, tape: &mut Tape) -> Result<Option<Reply>, Lost> {
-        let now = self.clock.now();
+    fn send_or_wake(&mut self, now: Time, tape: &mut Tape) -> Result<Option<Reply>, Lost> {
         match self.not_before {
             Some(not_before) if now >= not_before.max(self.guard.earliest_send(now)) => {
                 self.not_before = None;
-                let sent_at = self.clock.now();
                 self.link.write(self.guard.frame())?;
-                self.guard.sent(sent_at);
+                self.guard.sent(now);
                 if let Some(expectation) = &mut self.expectation {
-                    expectation.asked(self.guard.frame(), sent_at);
+                    expectation.asked(self.guard.frame(), now);
                 }
-                tape.sent(sent_at, self.guard.frame());
+                tape.sent(now, self.guard.frame());
                 Ok(None)
             }
             Some(_) => Ok(None),

@@ -35,8 +35,9 @@ pub struct Spread {
     counts: [u32; BUCKETS],
     sum: Duration,
     window: Duration,
-    /// The number of the younger window, counted from the start.
+    /// The number of the younger window, counted from the start, and when it ends.
     number: u64,
+    ends_at: Time,
     young: Window,
     old: Window,
 }
@@ -71,7 +72,9 @@ impl Spread {
     /// `window`: what is told of as lately is between this and twice as long ago.
     pub fn new(window: Duration) -> Spread {
         let empty = Window { counts: [0; BUCKETS], least: u32::MAX, most: 0 };
-        Spread { counts: [0; BUCKETS], sum: Duration::ZERO, window, number: 0, young: empty, old: empty }
+        let ends_at = Time::default() + window;
+        let (young, old) = (empty, empty);
+        Spread { counts: [0; BUCKETS], sum: Duration::ZERO, window, number: 0, ends_at, young, old }
     }
 
     pub fn add(&mut self, now: Time, time: Duration) {
@@ -106,13 +109,14 @@ impl Spread {
 
     /// Lets windows pass that are over.
     fn turn_to(&mut self, now: Time) {
-        let number = now.0 / (self.window.as_micros() as u64).max(1);
-        if number == self.number {
+        if now < self.ends_at {
             return;
         }
+        let window = (self.window.as_micros() as u64).max(1);
+        let number = now.0 / window;
         let empty = Window { counts: [0; BUCKETS], least: u32::MAX, most: 0 };
         self.old = if number == self.number + 1 { self.young } else { empty };
-        (self.young, self.number) = (empty, number);
+        (self.young, self.number, self.ends_at) = (empty, number, Time((number + 1) * window));
     }
 
     fn percentiles(&self) -> Option<Percentiles> {
