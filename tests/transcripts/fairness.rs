@@ -43,6 +43,23 @@ fn a_watchdog_is_fed_in_time() {
 }
 
 #[test]
+fn a_watchdog_that_no_line_could_feed_in_time_is_put_right_by_a_command() {
+    let asked = play_with(1, |bus, now| {
+        if now == Time::from_millis(10_000) {
+            let (device, point, payload) = ("relays".into(), "watchdog".into(), "0".into());
+            bus.handle(now, Event::Command(Command { device, point, payload, retained: false }));
+        }
+    });
+    let asked_between = |from: u64, to: u64| {
+        let within = Time::from_millis(from)..Time::from_millis(to);
+        asked.iter().filter(|asked| asked.1 == 20 && within.contains(&asked.0)).count()
+    };
+    // Before it, the line is full of feedings; a second later there are its polls.
+    assert!(asked_between(5_000, 10_000) > 150, "{}", asked_between(5_000, 10_000));
+    assert!(asked_between(11_000, 16_000) < 20, "{}", asked_between(11_000, 16_000));
+}
+
+#[test]
 fn a_poll_that_waits_for_the_line_makes_way_for_a_heartbeat() {
     let settings = devices::settings("device damper 1 damper.yaml\ndevice heating 2 thermometer\n");
     let mut bus = Bus::new(Time::default(), &settings, 0, &Memories::default());
@@ -111,8 +128,13 @@ fn longest(times: &[Time]) -> Duration {
 
 /// Plays a minute; returns when which unit was asked, and for which register first.
 fn play(flood: Flood) -> Vec<(Time, u8, u16)> {
+    play_with(60, flood)
+}
+
+/// The same, with so many hundredths of a second for the watchdog.
+fn play_with(watchdog: u16, flood: Flood) -> Vec<(Time, u8, u16)> {
     let mut bus = Bus::new(Time::default(), &devices::settings(DEVICES), 0, &Memories::default());
-    let mut registers = BTreeMap::from([((20, 66), 60)]);
+    let mut registers = BTreeMap::from([((20, 66), watchdog)]);
     let mut asked = Vec::new();
     let mut now = Time::default();
     bus.handle(now, Event::LinkUp);

@@ -139,7 +139,8 @@ impl DeviceState {
             Presence::Absent { reason } | Presence::Mismatch { reason } => reason.clone(),
             Presence::Present => match self.unknown_selector(target) {
                 Some(selector) => format!("waiting for {}", self.details(selector).name),
-                None => "the device does not answer".to_string(),
+                None if self.patience.failures() > 0 => "the device does not answer".to_string(),
+                None => "the bus had no time for it".to_string(),
             },
         }
     }
