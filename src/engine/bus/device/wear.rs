@@ -91,8 +91,8 @@ impl Wear {
         let until = self.budget_at();
         (now < until).then(|| {
             format!(
-                "the EEPROM budget of this device is spent ({} writes in 24 hours, `eeprom: {{daily: …}}`); \
-                 the next write may come in {} s",
+                "the EEPROM budget of this device is spent (`eeprom: {{daily: {}}}`: half of them at once, the \
+                 others as the day goes on); the next write may come in {} s",
                 self.rules.daily,
                 (until - now).as_secs() + 1
             )
