@@ -43,8 +43,8 @@ impl DeviceState {
         let memory = memories.devices.get(&self.settings.name).cloned().unwrap_or_default();
         self.keeping.plan = memory::fingerprint(device, &reads);
         self.counters.persistent_writes = memory.persistent_writes;
-        if let Some(left) = memory.writes_left {
-            self.wear.recall(left);
+        if let Some(spent) = memory.writes_spent {
+            self.wear.recall(spent);
         }
         // Another profile asks otherwise, and is refused otherwise.
         if memory.plan == self.keeping.plan {
@@ -67,7 +67,7 @@ impl DeviceState {
             plan: if self.refused.is_empty() { String::new() } else { self.keeping.plan.clone() },
             refused: self.refused.clone(),
             persistent_writes: self.counters.persistent_writes,
-            writes_left: (self.counters.persistent_writes > 0).then(|| self.wear.writes_left(now)),
+            writes_spent: (self.counters.persistent_writes > 0).then(|| self.wear.writes_spent(now)),
             section: self.upkeep.section().clone(),
             settled: self.upkeep.settled(),
         }
