@@ -3,10 +3,13 @@
 
 use std::collections::BTreeMap;
 
+use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Action, Bus, Command, Event};
 use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request};
+use busker::engine::request::{self, Verb, Wish};
 use busker::engine::time::{Duration, Time};
+use busker::engine::transaction::Transaction;
 
 use crate::devices;
 
@@ -57,6 +60,24 @@ fn a_watchdog_that_no_line_could_feed_in_time_is_put_right_by_a_command() {
     // Before it, the line is full of feedings; a second later there are its polls.
     assert!(asked_between(5_000, 10_000) > 150, "{}", asked_between(5_000, 10_000));
     assert!(asked_between(11_000, 16_000) < 20, "{}", asked_between(11_000, 16_000));
+}
+
+#[test]
+fn nor_does_it_keep_requests_from_the_line() {
+    let asked = play_with(1, |bus, now| {
+        if now == Time::from_millis(10_000) {
+            for at in [40, 41] {
+                let span = Span::new(Table::Input, at, at).expect("a register");
+                let wish = Wish::Read { device: "heating".into(), span, clears: false };
+                let transaction = Transaction::default();
+                bus.handle(now, Event::Request(request::Request { verb: Verb::Read, transaction, wish }));
+            }
+        }
+    });
+    let of_requests = asked.into_iter().filter(|asked| asked.2 >= 40 && asked.2 < 42);
+    let told: Vec<(u16, bool)> =
+        of_requests.map(|asked| (asked.2, asked.0 < Time::from_millis(11_000))).collect();
+    assert_eq!(told, [(40, true), (41, true)]);
 }
 
 #[test]

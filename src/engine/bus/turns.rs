@@ -47,12 +47,14 @@ impl Bus {
             }
             // Whoever else wants something has had the chance, and the next feeding may come.
             let was_held_back = std::mem::take(&mut self.fed_in_a_row) >= FED_IN_A_ROW;
-            if self.next_fetch()
-                || self.begin_request()
-                || self.begin_setting()
-                || self.next_scan()
-                || (was_held_back && self.nourish(false))
-            {
+            if self.next_fetch() || self.begin_request() || self.begin_setting() || self.next_scan() {
+                continue;
+            }
+            if was_held_back && self.nourish(false) {
+                // Reads that are due have their turns between feedings: the next setting, or question of a
+                // request, has not to wait for them.
+                self.wrote_setting = false;
+                self.requests_go_on();
                 continue;
             }
             let now = self.now;
