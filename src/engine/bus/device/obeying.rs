@@ -205,13 +205,14 @@ impl DeviceState {
     /// done, but there are devices that answer 3 and write the nearest value.
     pub(in crate::engine::bus) fn has_written(
         &mut self,
+        now: Time,
         result: &Result<Answer, RequestError>,
         context: &mut Context,
     ) -> u64 {
         let writes = self.wear.end(*result != Err(RequestError::Exception(6)));
         if writes > 0 {
             self.counters.persistent_writes += writes;
-            self.keeping.has_changed(context);
+            self.keeping.is_to_be_kept_soon(now, context);
         }
         writes
     }
