@@ -155,6 +155,14 @@ fn seconds_since_a_day_are_a_moment() {
 }
 
 #[test]
+fn bytes_that_are_no_text_are_not_written_as_one() {
+    let text = Form::new(Kind::Text { registers: 4 });
+    check_write(text.clone(), WriteRule::Any, "K\u{fc}che", Ok("4BC3 BC63 6865 0000"));
+    let wished = String::from_utf8_lossy(b"K\xFCche");
+    check_write(text, WriteRule::Any, &wished, Err("`K\u{fffd}che` is not UTF-8; expected a text in it"));
+}
+
+#[test]
 fn a_wish_is_checked_rounded_and_encoded() {
     let seconds = with(Kind::U16, |form| form.scale = decimal("0.01"));
     let range = |min: &str, max: &str, step: Option<&str>| WriteRule::Range {

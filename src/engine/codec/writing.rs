@@ -310,6 +310,10 @@ fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
             if text.len() > room || text.contains(char::is_control) {
                 return Err(format!("`{text}` is longer than {room} bytes or has control characters"));
             }
+            // What stands for bytes that are no UTF-8 is not what was wished for.
+            if text.contains(char::REPLACEMENT_CHARACTER) {
+                return Err(format!("`{text}` is not UTF-8; expected a text in it"));
+            }
             let mut bytes = text.as_bytes().to_vec();
             bytes.resize(room, 0);
             let swap = form.order.swaps_bytes();
