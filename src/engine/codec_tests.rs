@@ -317,6 +317,10 @@ fn what_is_made_of_a_wish_is_said() {
     let resolved = resolve(&float, 0, &[None]).expect("a plain form resolves");
     let found = obey(&float.points[0], &write, &resolved, "21.1");
     assert_eq!(found, Ok(Obeyed { words: words("41A8 CCCD"), note: None }));
-    let found = obey(&float.points[0], &write, &resolved, "3.4e38");
-    assert_eq!(found, Err("`3.4e38` is too large".to_string()));
+    for (text, hex) in [("3.4e38", "7F7F C99E"), ("5.551115123125783e-17", "2480 0000")] {
+        let found = obey(&float.points[0], &write, &resolved, text).map(|obeyed| obeyed.words);
+        assert_eq!(found, Ok(words(hex)), "{text}");
+    }
+    let found = obey(&float.points[0], &write, &resolved, "3.5e38");
+    assert_eq!(found, Err("`3.5e38` is too large for the register".to_string()));
 }

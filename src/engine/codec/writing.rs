@@ -45,8 +45,8 @@ fn nearest_end(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Option<
 }
 
 /// The number that a wish is. Calculations with floats leave more digits than a [`Decimal`] keeps, as in
-/// `5.551115123125783e-17`: what is behind the last of them makes no difference to any register, and what is
-/// too large for them is so for every register.
+/// `5.551115123125783e-17`: what is behind the last of them makes no difference to a whole number, and what is
+/// too large for them is beyond every limit.
 fn wished_number(text: &str) -> Result<Decimal, String> {
     let typed = text.trim();
     if let Some(number) = Decimal::parse(typed) {
@@ -264,12 +264,15 @@ fn rounded_quotient(number: Decimal, divisor: Decimal) -> Option<i128> {
 
 fn encode_float(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Result<Vec<u16>, String> {
     let form = resolved.form;
-    let wanted = wished_number(text)?;
-    check_limits(resolved, rule, wanted, text)?;
-    if wanted.to_f64().abs() >= TOO_LARGE {
-        return Err(format!("`{text}` is too large"));
+    check_limits(resolved, rule, wished_number(text)?, text)?;
+    // A float holds what has too many digits for a decimal.
+    let wanted: f64 = text.trim().parse().map_err(|_| format!("`{text}` is not a number"))?;
+    if let Some(limits) = limits(resolved, rule) {
+        if wanted < limits.min.to_f64() || wanted > limits.max.to_f64() {
+            return Err(format!("`{text}` is outside {} to {}", limits.min, limits.max));
+        }
     }
-    let register = (wanted.to_f64() - form.offset.to_f64()) / form.scale.to_f64();
+    let register = (wanted - form.offset.to_f64()) / form.scale.to_f64();
     let finite =
         |fits: bool| if fits { Ok(()) } else { Err(format!("`{text}` is too large for the register")) };
     let bytes = if form.kind == Kind::F32 {
