@@ -155,6 +155,14 @@ fn seconds_since_a_day_are_a_moment() {
 }
 
 #[test]
+fn bytes_that_are_no_text_are_not_written_as_one() {
+    let text = Form::new(Kind::Text { registers: 4 });
+    check_write(text.clone(), WriteRule::Any, "K\u{fc}che", Ok("4BC3 BC63 6865 0000"));
+    let wished = String::from_utf8_lossy(b"K\xFCche");
+    check_write(text, WriteRule::Any, &wished, Err("`K\u{fffd}che` is not UTF-8; expected a text in it"));
+}
+
+#[test]
 fn a_wish_is_checked_rounded_and_encoded() {
     let seconds = with(Kind::U16, |form| form.scale = decimal("0.01"));
     let range = |min: &str, max: &str, step: Option<&str>| WriteRule::Range {
@@ -269,6 +277,14 @@ fn what_is_made_of_a_wish_is_said() {
         // What a calculation with floats leaves is nothing to speak of.
         (&any, refuse, "21.400000000000002", Ok(("00D6", None))),
         (&any, refuse, "0.30000000000000004", Ok(("0003", None))),
+        (&any, refuse, "5.551115123125783e-17", Ok(("0000", None))),
+        (&any, refuse, "-2.220446049250313e-16", Ok(("0000", None))),
+        (&any, refuse, "21.49999999999999911182158029987", Ok(("00D7", None))),
+        (&any, refuse, "1e-300", Ok(("0000", None))),
+        (&any, refuse, "1e31", Err("`1e31` is outside -5 to 30")),
+        (&any, refuse, "-1e400", Err("`-1e400` is outside -5 to 30")),
+        (&any, refuse, "inf", Err("`inf` is not a number")),
+        (&any, refuse, "1e", Err("`1e` is not a number")),
         (&any, refuse, "21.44", Ok(("00D6", Some("`21.44` is rounded to 21.4")))),
         (&any, refuse, "1e-05", Ok(("0000", Some("`1e-05` is rounded to 0.0")))),
         (&half, refuse, "21.3", Ok(("00D7", Some("`21.3` is rounded to 21.5")))),
@@ -281,6 +297,7 @@ fn what_is_made_of_a_wish_is_said() {
             "-1e6",
             Ok(("FFCE", Some("`-1e6` is out of range, and -5.0 the nearest value in it"))),
         ),
+        (&any, clamp, "1e31", Ok(("012C", Some("`1e31` is out of range, and 30.0 the nearest value in it")))),
         (&any, clamp, "automatic", Ok(("2B67", None))),
         (&any, clamp, "nan", Err("`nan` is not a number")),
     ] {
@@ -300,4 +317,10 @@ fn what_is_made_of_a_wish_is_said() {
     let resolved = resolve(&float, 0, &[None]).expect("a plain form resolves");
     let found = obey(&float.points[0], &write, &resolved, "21.1");
     assert_eq!(found, Ok(Obeyed { words: words("41A8 CCCD"), note: None }));
+    for (text, hex) in [("3.4e38", "7F7F C99E"), ("5.551115123125783e-17", "2480 0000")] {
+        let found = obey(&float.points[0], &write, &resolved, text).map(|obeyed| obeyed.words);
+        assert_eq!(found, Ok(words(hex)), "{text}");
+    }
+    let found = obey(&float.points[0], &write, &resolved, "3.5e38");
+    assert_eq!(found, Err("`3.5e38` is too large for the register".to_string()));
 }

@@ -24,8 +24,8 @@ pub struct Memory {
     pub refused: Vec<Span>,
     /// Writes to points in EEPROM since the installation.
     pub persistent_writes: u64,
-    /// How many of them were left of the day's budget.
-    pub writes_left: Option<u32>,
+    /// How many of them still lessen the day's budget.
+    pub writes_spent: Option<u32>,
     /// The section `settings` as it was last seen: points and what they shall hold.
     pub section: BTreeMap<String, String>,
     /// The settings of that section for which all has been done, and how that ended: `done`,
@@ -56,7 +56,7 @@ struct File {
     refused: Vec<String>,
     persistent_writes: u64,
     #[serde(default)]
-    writes_left: Option<u32>,
+    writes_spent: Option<u32>,
     settings: BTreeMap<String, String>,
     settled: BTreeMap<String, String>,
 }
@@ -76,7 +76,7 @@ impl Memory {
             plan: file.plan,
             refused: refused.collect::<Result<_, _>>()?,
             persistent_writes: file.persistent_writes,
-            writes_left: file.writes_left,
+            writes_spent: file.writes_spent,
             section: file.settings,
             settled: file.settled,
         })
@@ -89,7 +89,7 @@ impl Memory {
             plan: self.plan.clone(),
             refused: self.refused.iter().map(Span::to_string).collect(),
             persistent_writes: self.persistent_writes,
-            writes_left: self.writes_left,
+            writes_spent: self.writes_spent,
             settings: self.section.clone(),
             settled: self.settled.clone(),
         };
@@ -120,7 +120,7 @@ mod tests {
             plan: "0123456789abcdef".into(),
             refused: vec![<Span as Scalar>::parse("holding 3..7").expect("a span")],
             persistent_writes: 12,
-            writes_left: Some(488),
+            writes_spent: Some(12),
             section: map(&[("mode", "pt1000"), ("watchdog", "30s")]),
             settled: map(&[("watchdog", "done")]),
         }

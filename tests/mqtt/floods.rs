@@ -135,7 +135,7 @@ fn when_the_budget_of_a_device_is_spent_the_rest_is_refused_and_wears_nothing() 
     assert_eq!(bench.counted("persistent_writes"), 5);
     let refused = json(&bench.watcher.payloads("busker/valves/watchdog/outcome")[0]);
     let reason = refused["reason"].as_str().expect("a reason");
-    assert!(reason.contains("10 writes in 24 hours") && reason.contains("the next write may come in"));
+    assert!(reason.contains("`eeprom: {daily: 10}`") && reason.contains("the next write may come in"));
     // Not of another point either; what is not kept goes on, and so does what is there already.
     assert!(bench.burst("output_2_default", &["5".into()]).contains_key("refused"));
     assert!(bench.burst("watchdog", &["104".into()]).contains_key("unchanged"));

@@ -3,10 +3,13 @@
 
 use std::collections::BTreeMap;
 
+use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Action, Bus, Command, Event};
 use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request};
+use busker::engine::request::{self, Verb, Wish};
 use busker::engine::time::{Duration, Time};
+use busker::engine::transaction::Transaction;
 
 use crate::devices;
 
@@ -40,6 +43,41 @@ fn a_watchdog_is_fed_in_time() {
         let requests: Vec<Time> = asked.skip_while(|asked| asked.2 != 66).map(|asked| asked.0).collect();
         assert!(longest(&requests) < WATCHDOG - TRANSACTION, "{:?} without a request", longest(&requests));
     }
+}
+
+#[test]
+fn a_watchdog_that_no_line_could_feed_in_time_is_put_right_by_a_command() {
+    let asked = play_with(1, |bus, now| {
+        if now == Time::from_millis(10_000) {
+            let (device, point, payload) = ("relays".into(), "watchdog".into(), "0".into());
+            bus.handle(now, Event::Command(Command { device, point, payload, retained: false }));
+        }
+    });
+    let asked_between = |from: u64, to: u64| {
+        let within = Time::from_millis(from)..Time::from_millis(to);
+        asked.iter().filter(|asked| asked.1 == 20 && within.contains(&asked.0)).count()
+    };
+    // Before it, the line is full of feedings; a second later there are its polls.
+    assert!(asked_between(5_000, 10_000) > 150, "{}", asked_between(5_000, 10_000));
+    assert!(asked_between(11_000, 16_000) < 20, "{}", asked_between(11_000, 16_000));
+}
+
+#[test]
+fn nor_does_it_keep_requests_from_the_line() {
+    let asked = play_with(1, |bus, now| {
+        if now == Time::from_millis(10_000) {
+            for at in [40, 41] {
+                let span = Span::new(Table::Input, at, at).expect("a register");
+                let wish = Wish::Read { device: "heating".into(), span, clears: false };
+                let transaction = Transaction::default();
+                bus.handle(now, Event::Request(request::Request { verb: Verb::Read, transaction, wish }));
+            }
+        }
+    });
+    let of_requests = asked.into_iter().filter(|asked| asked.2 >= 40 && asked.2 < 42);
+    let told: Vec<(u16, bool)> =
+        of_requests.map(|asked| (asked.2, asked.0 < Time::from_millis(11_000))).collect();
+    assert_eq!(told, [(40, true), (41, true)]);
 }
 
 #[test]
@@ -111,8 +149,13 @@ fn longest(times: &[Time]) -> Duration {
 
 /// Plays a minute; returns when which unit was asked, and for which register first.
 fn play(flood: Flood) -> Vec<(Time, u8, u16)> {
+    play_with(60, flood)
+}
+
+/// The same, with so many hundredths of a second for the watchdog.
+fn play_with(watchdog: u16, flood: Flood) -> Vec<(Time, u8, u16)> {
     let mut bus = Bus::new(Time::default(), &devices::settings(DEVICES), 0, &Memories::default());
-    let mut registers = BTreeMap::from([((20, 66), 60)]);
+    let mut registers = BTreeMap::from([((20, 66), watchdog)]);
     let mut asked = Vec::new();
     let mut now = Time::default();
     bus.handle(now, Event::LinkUp);

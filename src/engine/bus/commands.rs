@@ -267,7 +267,7 @@ impl Bus {
     pub(super) fn command_answered(&mut self, result: Result<Answer, RequestError>) {
         let Some(mut active) = self.active.take() else { return };
         let state = &mut self.devices[active.device];
-        self.counters.persistent_writes += state.has_written(&result, &mut self.context);
+        self.counters.persistent_writes += state.has_written(self.now, &result, &mut self.context);
         if let (true, Ok(answer)) = (active.flow.reads(), &result) {
             let words = command::words_of(answer);
             state.read_for_command(self.now, active.flow.point(), &words, &mut self.context);

@@ -154,6 +154,8 @@ pub struct Bus {
     in_flight: Option<InFlight>,
     /// Requests in a row that were wanted at once.
     ahead: u32,
+    /// Heartbeats and feedings in a row.
+    fed_in_a_row: u32,
     pace: Pace,
     link_state: LinkState,
     connection: link::Connection,
@@ -275,6 +277,7 @@ impl Bus {
             wrote_setting: false,
             in_flight: None,
             ahead: 0,
+            fed_in_a_row: 0,
             pace: Pace::default(),
             link_state: LinkState::Down { reason: None, attempts: 0 },
             connection: link::Connection::default(),

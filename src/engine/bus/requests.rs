@@ -230,7 +230,7 @@ impl Bus {
     pub(super) fn request_answered(&mut self, sent_at: Time, result: Result<Answer, RequestError>) {
         let Some(Running { request, device, mut flow, .. }) = self.requests.running.take() else { return };
         let state = &mut self.devices[device];
-        self.counters.persistent_writes += state.has_written(&result, &mut self.context);
+        self.counters.persistent_writes += state.has_written(self.now, &result, &mut self.context);
         if flow.wants_presence() {
             match &result {
                 Ok(_) | Err(RequestError::Exception(_) | RequestError::Impossible(_)) => {}

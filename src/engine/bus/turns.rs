@@ -3,7 +3,8 @@
 //! The order: the command that has begun, heartbeats and watchdogs that are late, waiting commands,
 //! heartbeats and watchdogs, what somebody asked for, settings that are not as they are wanted, a scan, then
 //! whichever device's read (or identification) is most urgent. Nobody who asks without end keeps a read that
-//! is due from the wire: [`AHEAD_OF_READS`].
+//! is due from the wire: [`AHEAD_OF_READS`]; and no watchdog that wants too much keeps a command from it:
+//! [`FED_IN_A_ROW`].
 
 use crate::engine::address::Span;
 use crate::engine::modbus::{Call, Request};
@@ -18,6 +19,11 @@ use super::{Action, Bus, GivesWay, InFlight, LinkState, OnBrokerLoss, Purpose};
 /// the read has its turn: under a flood of commands every period stretches, but nothing starves.
 const AHEAD_OF_READS: u32 = 8;
 
+/// So many heartbeats and feedings in a row may go before whatever else somebody wants. More are never needed but
+/// where a device allows less time than the line can keep. There they may not keep from the wire what ends it: the
+/// command, perhaps, that puts the time right.
+const FED_IN_A_ROW: u32 = 8;
+
 impl Bus {
     /// Asks what is to be asked next, if the line is free.
     pub(super) fn ask_next(&mut self) {
@@ -29,17 +35,26 @@ impl Bus {
                 self.send(device, call, Purpose::BeatWrite(point));
                 continue;
             }
-            if self.begin_overdue_read()
-                || self.begin_beat(true)
-                || self.feed(true)
-                || self.begin_command()
-                || self.begin_beat(false)
-                || self.feed(false)
-                || self.next_fetch()
-                || self.begin_request()
-                || self.begin_setting()
-                || self.next_scan()
-            {
+            if self.begin_overdue_read() || self.nourish(true) {
+                continue;
+            }
+            if self.begin_command() {
+                self.fed_in_a_row = 0;
+                continue;
+            }
+            if self.nourish(false) {
+                continue;
+            }
+            // Whoever else wants something has had the chance, and the next feeding may come.
+            let was_held_back = std::mem::take(&mut self.fed_in_a_row) >= FED_IN_A_ROW;
+            if self.next_fetch() || self.begin_request() || self.begin_setting() || self.next_scan() {
+                continue;
+            }
+            if was_held_back && self.nourish(false) {
+                // Reads that are due have their turns between feedings: the next setting, or question of a
+                // request, has not to wait for them.
+                self.wrote_setting = false;
+                self.requests_go_on();
                 continue;
             }
             let now = self.now;
@@ -100,6 +115,14 @@ impl Bus {
             in_flight.gives_way = GivesWay::Nobody;
         }
         true
+    }
+
+    /// Heartbeats and watchdogs, those that are due or only those that are `late`; until there were
+    /// [`FED_IN_A_ROW`].
+    fn nourish(&mut self, late: bool) -> bool {
+        let is_begun = self.fed_in_a_row < FED_IN_A_ROW && (self.begin_beat(late) || self.feed(late));
+        self.fed_in_a_row += u32::from(is_begun);
+        is_begun
     }
 
     /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.

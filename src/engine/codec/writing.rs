@@ -26,7 +26,7 @@ pub fn obey(point: &Point, write: &Write, resolved: &Resolved<'_>, text: &str) -
     let note = match (end, &taken) {
         (Some(_), taken) => Some(format!("`{text}` is out of range, and {taken} the nearest value in it")),
         (None, Reading::Number(taken)) => {
-            let wanted = Decimal::parse(text.trim()).filter(|wanted| !is_noise(resolved, *wanted, *taken));
+            let wanted = wished_number(text).ok().filter(|wanted| !is_noise(resolved, *wanted, *taken));
             wanted.map(|_| format!("`{text}` is rounded to {taken}"))
         }
         _ => None,
@@ -37,12 +37,32 @@ pub fn obey(point: &Point, write: &Write, resolved: &Resolved<'_>, text: &str) -
 /// The end of the range that a number is beyond.
 fn nearest_end(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Option<String> {
     let is_name = resolved.form.names.list().iter().any(|(_, name)| name == text);
-    let (limits, wanted) = (limits(resolved, rule)?, Decimal::parse(text.trim()).filter(|_| !is_name)?);
+    let (limits, wanted) = (limits(resolved, rule)?, wished_number(text).ok().filter(|_| !is_name)?);
     if wanted.compare(limits.min).is_lt() {
         return Some(limits.min.to_string());
     }
     wanted.compare(limits.max).is_gt().then(|| limits.max.to_string())
 }
+
+/// The number that a wish is. Calculations with floats leave more digits than a [`Decimal`] keeps, as in
+/// `5.551115123125783e-17`: what is behind the last of them makes no difference to a whole number, and what is
+/// too large for them is beyond every limit.
+fn wished_number(text: &str) -> Result<Decimal, String> {
+    let typed = text.trim();
+    if let Some(number) = Decimal::parse(typed) {
+        return Ok(number);
+    }
+    // `inf` and `nan` are floats, and no numbers.
+    let is_number = typed.bytes().all(|byte| byte.is_ascii_digit() || b"+-.eE".contains(&byte));
+    let number = typed.parse::<f64>().ok().filter(|_| is_number);
+    let number = number.ok_or_else(|| format!("`{text}` is not a number"))?;
+    let decimals = if number.abs() < 1e10 { usize::from(Decimal::DECIMALS_MAX) } else { 0 };
+    let nearest = Decimal::parse(&format!("{:.decimals$}", number.clamp(-TOO_LARGE, TOO_LARGE)));
+    nearest.map(Decimal::normalized).ok_or_else(|| format!("`{text}` is not a number"))
+}
+
+/// No wish is larger: what is beyond it counts as this.
+const TOO_LARGE: f64 = 1e29;
 
 /// Whether the two differ only by what a calculation with floats leaves: 21.400000000000002 is 21.4.
 fn is_noise(resolved: &Resolved<'_>, wanted: Decimal, taken: Decimal) -> bool {
@@ -166,7 +186,7 @@ fn checked_number(
     text: &str,
 ) -> Result<i128, String> {
     let form = resolved.form;
-    let wanted = Decimal::parse(text.trim()).ok_or_else(|| format!("`{text}` is not a number"))?;
+    let wanted = wished_number(text)?;
     check_limits(resolved, rule, wanted, text)?;
     let step = match rule {
         WriteRule::Range { step: Some(_), .. } => limits(resolved, rule).and_then(|limits| limits.step),
@@ -244,9 +264,15 @@ fn rounded_quotient(number: Decimal, divisor: Decimal) -> Option<i128> {
 
 fn encode_float(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Result<Vec<u16>, String> {
     let form = resolved.form;
-    let wanted = Decimal::parse(text.trim()).ok_or_else(|| format!("`{text}` is not a number"))?;
-    check_limits(resolved, rule, wanted, text)?;
-    let register = (wanted.to_f64() - form.offset.to_f64()) / form.scale.to_f64();
+    check_limits(resolved, rule, wished_number(text)?, text)?;
+    // A float holds what has too many digits for a decimal.
+    let wanted: f64 = text.trim().parse().map_err(|_| format!("`{text}` is not a number"))?;
+    if let Some(limits) = limits(resolved, rule) {
+        if wanted < limits.min.to_f64() || wanted > limits.max.to_f64() {
+            return Err(format!("`{text}` is outside {} to {}", limits.min, limits.max));
+        }
+    }
+    let register = (wanted - form.offset.to_f64()) / form.scale.to_f64();
     let finite =
         |fits: bool| if fits { Ok(()) } else { Err(format!("`{text}` is too large for the register")) };
     let bytes = if form.kind == Kind::F32 {
@@ -286,6 +312,10 @@ fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
             let room = usize::from(registers) * 2;
             if text.len() > room || text.contains(char::is_control) {
                 return Err(format!("`{text}` is longer than {room} bytes or has control characters"));
+            }
+            // What stands for bytes that are no UTF-8 is not what was wished for.
+            if text.contains(char::REPLACEMENT_CHARACTER) {
+                return Err(format!("`{text}` is not UTF-8; expected a text in it"));
             }
             let mut bytes = text.as_bytes().to_vec();
             bytes.resize(room, 0);

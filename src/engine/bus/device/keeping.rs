@@ -14,8 +14,9 @@ use crate::engine::bus::waiting::Target;
 /// A device's memory is stored no more often than this, whatever is written to the device: it may lie
 /// on a memory card.
 const STORE_INTERVAL: Duration = Duration::from_secs(10);
-/// That a setting has been seen to is stored so soon: a restart right after it must not write again.
-const STORE_SETTLED_AFTER: Duration = Duration::from_secs(1);
+/// That a setting has been seen to is stored so soon: a restart right after it must not write again. And a write to
+/// EEPROM, which is counted for life, and seldom enough by its budget: a power failure must not make it undone.
+const STORE_SOON: Duration = Duration::from_secs(1);
 
 /// What is stored of a device, and when next.
 #[derive(Clone, Debug, Default)]
@@ -32,6 +33,12 @@ impl Keeping {
     pub(super) fn has_changed(&mut self, context: &mut Context) {
         (self.changed, context.has_to_remember) = (true, true);
     }
+
+    /// The same for what is to outlive a power failure.
+    pub(super) fn is_to_be_kept_soon(&mut self, now: Time, context: &mut Context) {
+        self.not_before = self.not_before.min(now + STORE_SOON);
+        self.has_changed(context);
+    }
 }
 
 impl DeviceState {
@@ -43,8 +50,8 @@ impl DeviceState {
         let memory = memories.devices.get(&self.settings.name).cloned().unwrap_or_default();
         self.keeping.plan = memory::fingerprint(device, &reads);
         self.counters.persistent_writes = memory.persistent_writes;
-        if let Some(left) = memory.writes_left {
-            self.wear.recall(left);
+        if let Some(spent) = memory.writes_spent {
+            self.wear.recall(spent);
         }
         // Another profile asks otherwise, and is refused otherwise.
         if memory.plan == self.keeping.plan {
@@ -67,7 +74,7 @@ impl DeviceState {
             plan: if self.refused.is_empty() { String::new() } else { self.keeping.plan.clone() },
             refused: self.refused.clone(),
             persistent_writes: self.counters.persistent_writes,
-            writes_left: (self.counters.persistent_writes > 0).then(|| self.wear.writes_left(now)),
+            writes_spent: (self.counters.persistent_writes > 0).then(|| self.wear.writes_spent(now)),
             section: self.upkeep.section().clone(),
             settled: self.upkeep.settled(),
         }
@@ -100,8 +107,7 @@ impl DeviceState {
             context.say(severity, format!("device {}: {}", self.settings.name, note.text));
         }
         if self.upkeep.take_settled_changed() {
-            self.keeping.has_changed(context);
-            self.keeping.not_before = self.keeping.not_before.min(now + STORE_SETTLED_AFTER);
+            self.keeping.is_to_be_kept_soon(now, context);
         }
         self.upkeep.take_drift_changed()
     }

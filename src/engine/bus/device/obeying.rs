@@ -139,7 +139,8 @@ impl DeviceState {
             Presence::Absent { reason } | Presence::Mismatch { reason } => reason.clone(),
             Presence::Present => match self.unknown_selector(target) {
                 Some(selector) => format!("waiting for {}", self.details(selector).name),
-                None => "the device does not answer".to_string(),
+                None if self.patience.failures() > 0 => "the device does not answer".to_string(),
+                None => "the bus had no time for it".to_string(),
             },
         }
     }
@@ -204,13 +205,14 @@ impl DeviceState {
     /// done, but there are devices that answer 3 and write the nearest value.
     pub(in crate::engine::bus) fn has_written(
         &mut self,
+        now: Time,
         result: &Result<Answer, RequestError>,
         context: &mut Context,
     ) -> u64 {
         let writes = self.wear.end(*result != Err(RequestError::Exception(6)));
         if writes > 0 {
             self.counters.persistent_writes += writes;
-            self.keeping.has_changed(context);
+            self.keeping.is_to_be_kept_soon(now, context);
         }
         writes
     }

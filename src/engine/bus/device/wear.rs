@@ -46,9 +46,10 @@ impl Wear {
         u64::from(rules.daily) * DAY
     }
 
-    /// Goes on with so many writes left of the budget, after a restart.
-    pub(super) fn recall(&mut self, writes_left: u32) {
-        self.left = (u64::from(writes_left) * WRITE).min(Wear::full(self.rules));
+    /// Goes on with so many writes taken out of the budget, after a restart. (What is left would not do: the
+    /// budget may be another one by then.)
+    pub(super) fn recall(&mut self, writes_spent: u32) {
+        self.left = Wear::full(self.rules).saturating_sub(u64::from(writes_spent) * WRITE);
     }
 
     /// The point is being written, perhaps with others.
@@ -91,17 +92,17 @@ impl Wear {
         let until = self.budget_at();
         (now < until).then(|| {
             format!(
-                "the EEPROM budget of this device is spent ({} writes in 24 hours, `eeprom: {{daily: …}}`); \
-                 the next write may come in {} s",
+                "the EEPROM budget of this device is spent (`eeprom: {{daily: {}}}`: half of them at once, the \
+                 others as the day goes on); the next write may come in {} s",
                 self.rules.daily,
                 (until - now).as_secs() + 1
             )
         })
     }
 
-    /// How many writes are left of the budget.
-    pub(super) fn writes_left(&self, now: Time) -> u32 {
-        (self.left(now) / WRITE) as u32
+    /// How many writes have been taken out of the budget, and have not come in again.
+    pub(super) fn writes_spent(&self, now: Time) -> u32 {
+        (Wear::full(self.rules) - self.left(now)).div_ceil(WRITE) as u32
     }
 
     fn left(&self, now: Time) -> u64 {
@@ -144,14 +145,34 @@ mod tests {
         // Half of the budget at once, and the other half as it comes in.
         assert_eq!(writes_in(24, 20, &mut Wear::new(RULES)), 200 - 1);
         let mut wear = Wear::new(RULES);
-        wear.recall(3);
+        wear.recall(100 - 3);
         let writes = writes_in(1, 20, &mut wear);
         assert_eq!(writes, 3 + 100 / 24);
         let now = Time::from_millis(3_600_000);
-        assert_eq!(wear.writes_left(now), 0);
+        assert_eq!(wear.writes_spent(now), 100);
         let told = wear.spent(now).expect("nothing is left");
-        assert!(told.contains("200 writes in 24 hours") && told.contains("may come in "), "{told}");
+        assert!(told.contains("`eeprom: {daily: 200}`") && told.contains("may come in "), "{told}");
         assert!(wear.spent(wear.budget_at()).is_none());
+    }
+
+    #[test]
+    fn a_budget_that_is_changed_is_less_by_what_was_written() {
+        let writes_at_once = |daily: u32| {
+            let mut few = Wear::new(Eeprom { daily: 8, ..RULES });
+            for point in 0..4 {
+                few.spend(Time::default(), point);
+            }
+            assert!(few.spent(Time::default()).is_some(), "half of 8 are written");
+            let mut changed = Wear::new(Eeprom { daily, ..RULES });
+            changed.recall(few.writes_spent(Time::default()));
+            let mut writes = 0;
+            while changed.spent(Time::default()).is_none() {
+                changed.spend(Time::default(), writes);
+                writes += 1;
+            }
+            writes
+        };
+        assert_eq!([8, 500, 20, 4].map(writes_at_once), [0, 246, 6, 0]);
     }
 
     #[test]
@@ -164,11 +185,11 @@ mod tests {
         for point in [1, 2] {
             wear.spend(at(100), point);
         }
-        assert_eq!((wear.allowed_at(1), wear.writes_left(at(100))), (at(160), 97));
+        assert_eq!((wear.allowed_at(1), wear.writes_spent(at(100))), (at(160), 3));
         wear.waiting = vec![7];
         assert_eq!(wear.end(false), 0);
         assert_eq!((wear.allowed_at(1), wear.allowed_at(2)), (at(65), Time::default()));
-        assert_eq!(wear.writes_left(at(100)), before.writes_left(at(100)));
+        assert_eq!(wear.writes_spent(at(100)), before.writes_spent(at(100)));
         assert_eq!(wear.waiting, [7], "what came meanwhile is kept");
         assert_eq!(wear.end(true), 0, "nothing is being written");
     }
