@@ -57,6 +57,9 @@ struct File {
     persistent_writes: u64,
     #[serde(default)]
     writes_spent: Option<u32>,
+    /// Kept before `writes_spent` was: what is left says nothing where the budget has changed since.
+    #[serde(default, skip_serializing, rename = "writes_left")]
+    _writes_left: Option<u32>,
     settings: BTreeMap<String, String>,
     settled: BTreeMap<String, String>,
 }
@@ -90,6 +93,7 @@ impl Memory {
             refused: self.refused.iter().map(Span::to_string).collect(),
             persistent_writes: self.persistent_writes,
             writes_spent: self.writes_spent,
+            _writes_left: None,
             settings: self.section.clone(),
             settled: self.settled.clone(),
         };
@@ -130,6 +134,12 @@ mod tests {
     fn what_is_kept_is_read_again() {
         assert_eq!(Memory::parse(&memory().to_text()), Ok(memory()));
         assert_eq!(Memory::parse(&Memory::default().to_text()), Ok(Memory::default()));
+    }
+
+    #[test]
+    fn what_an_earlier_version_has_kept_is_not_lost() {
+        let text = memory().to_text().replace("\"writes_spent\": 12", "\"writes_left\": 488");
+        assert_eq!(Memory::parse(&text), Ok(Memory { writes_spent: None, ..memory() }));
     }
 
     #[test]
