@@ -39,6 +39,32 @@ pub struct World {
     frames: Vec<(Time, u8, String)>,
     /// So often two spoke at the same time.
     pub collisions: u32,
+    /// What spoils characters again and again, for ever.
+    pub disturbance: Option<Disturbance>,
+    /// So many requests have been sent since there was one.
+    disturbed_requests: u32,
+}
+
+/// A disturbance that comes at a fixed period.
+#[derive(Clone, Copy, Debug)]
+pub enum Disturbance {
+    /// Each so-manieth request on the line, whoever is asked.
+    Request(u32),
+    /// Once in each `period`, whatever is on the line for so long.
+    Time { period: Duration, lasts: Duration },
+}
+
+impl Disturbance {
+    /// Whether it meets characters that are on the line from `from` to `to`.
+    fn meets(&self, from: Time, to: Time) -> bool {
+        match self {
+            Disturbance::Request(_) => false,
+            Disturbance::Time { period, lasts } => {
+                let (period, lasts) = (period.as_micros() as u64, lasts.as_micros() as u64);
+                from.0 % period < lasts || from.0 / period != to.0 / period
+            }
+        }
+    }
 }
 
 /// A message, and since when what it says may be true: since the request was sent that it answers.
@@ -84,6 +110,8 @@ impl World {
             published: Vec::new(),
             frames: Vec::new(),
             collisions: 0,
+            disturbance: None,
+            disturbed_requests: 0,
         }
     }
 
@@ -124,6 +152,10 @@ impl World {
     pub fn requests(&self) -> Vec<(Time, u8)> {
         let requests = self.frames.iter().filter(|(.., frame)| frame.contains(" -> "));
         requests.map(|(at, unit, _)| (*at, *unit)).collect()
+    }
+
+    pub fn answers(&self) -> u64 {
+        self.bus.summary(self.now).counters.answers
     }
 
     pub fn late_replies(&self) -> u64 {
@@ -169,7 +201,10 @@ impl World {
         }
         self.coming.sort_by_key(|(_, transmission)| transmission.at);
         while self.coming.first().is_some_and(|(_, transmission)| transmission.at <= now) {
-            let (sender, transmission) = self.coming.remove(0);
+            let (sender, mut transmission) = self.coming.remove(0);
+            if self.is_disturbed(now, transmission.bytes.len()) {
+                spoil(&mut transmission.bytes);
+            }
             let frame = format!("{now} <- {:02X?}", transmission.bytes);
             self.frames.push((now, sender.unwrap_or(0), frame));
             if matches!(self.port, Port::Open) {
@@ -182,7 +217,8 @@ impl World {
                 self.to_send = None;
                 let mut heard = self.guard.frame().to_vec();
                 let over_at = now + character_time(self.line.settings()) * heard.len() as u32;
-                if self.framing == Framing::Rtu && self.meets_another(None, over_at, heard.len()) {
+                let is_met = self.framing == Framing::Rtu && self.meets_another(None, over_at, heard.len());
+                if is_met || self.is_request_disturbed() || self.is_disturbed(over_at, heard.len()) {
                     spoil(&mut heard);
                 }
                 self.receiver.push(now, &heard);
@@ -272,6 +308,19 @@ impl World {
         }
         self.collisions += u32::from(is_met);
         is_met
+    }
+
+    /// Whether the request that is sent now is one of those which are spoilt by their number.
+    fn is_request_disturbed(&mut self) -> bool {
+        let Some(Disturbance::Request(every)) = self.disturbance else { return false };
+        self.disturbed_requests += 1;
+        self.disturbed_requests % every == 0
+    }
+
+    /// Whether a disturbance meets `count` characters that are over at `at`.
+    fn is_disturbed(&self, at: Time, count: usize) -> bool {
+        let length = (character_time(self.line.settings()) * count as u32).as_micros() as u64;
+        self.disturbance.is_some_and(|disturbance| disturbance.meets(Time(at.0.saturating_sub(length)), at))
     }
 
     fn answered(&mut self, reply: Option<Reply>) {

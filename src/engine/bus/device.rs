@@ -285,7 +285,9 @@ impl DeviceState {
         }
         let (index, urgency) = of_polls(&self.polls)?;
         // After a request in vain another one than the most urgent: it may be that read alone which gets no answer.
-        let other = (self.patience.failures() % 3 == 1).then(|| self.polls.oldest(now));
+        // After two, where it seems to be in step with what disturbs it: then it is asked twice in a row.
+        let asks_other_after = if self.polls.is_in_step(index) { 2 } else { 1 };
+        let other = (self.patience.failures() % 3 == asks_other_after).then(|| self.polls.oldest(now));
         Some((self.read_call(other.flatten().unwrap_or(index)), urgency))
     }
 
@@ -487,7 +489,7 @@ impl DeviceState {
     pub(super) fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         self.patience.unanswered();
         let demanded = self.settings.device.wire.response_timeout;
-        self.paused_until = now + self.patience.pause(self.full_timeout, demanded, self.settings.unit);
+        self.paused_until = now + self.patience.pause(now, self.full_timeout, demanded);
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {
             let advice = error.what_to_check().map_or(String::new(), |advice| format!("; {advice}"));
             let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row{advice}");
@@ -573,13 +575,16 @@ impl DeviceState {
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
                 self.failed(now, &error, context);
-                match (&self.presence, &error) {
-                    (
-                        Presence::Present,
-                        RequestError::Timeout | RequestError::Unreachable(_) | RequestError::Link(_),
-                    ) => self.polls.try_again(index, now, self.patience.failures() == 1),
-                    // It is there, and only its answer was spoilt.
-                    _ => self.polls.want_again(index),
+                let is_unheard = matches!(
+                    error,
+                    RequestError::Timeout | RequestError::Unreachable(_) | RequestError::Link(_)
+                );
+                if self.is_present() {
+                    self.polls.try_again(index, now, self.patience.failures() == 1);
+                }
+                // It is there, and only its answer was spoilt.
+                if !(self.is_present() && is_unheard) {
+                    self.polls.want_again(index);
                 }
                 self.unanswered(now, index, &error, context);
             }

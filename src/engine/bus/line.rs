@@ -25,6 +25,12 @@ const HEARD_MAX: usize = 1000;
 /// Units that are named.
 const UNITS_MAX: usize = 3;
 
+/// What is left alone behind a request without an answer, and until when.
+pub(super) struct Silence {
+    pub(super) of_line: Time,
+    pub(super) of_device: Time,
+}
+
 /// What was heard on the line beside the answers.
 #[derive(Debug, Default)]
 pub(super) struct Line {
@@ -37,6 +43,8 @@ pub(super) struct Line {
     told: bool,
     /// The device that was last given up before its full time, and until when its late answer may come.
     given_up: Option<(usize, Time)>,
+    /// No poll is sent before.
+    polls_from: Time,
 }
 
 impl Line {
@@ -46,6 +54,16 @@ impl Line {
         let forgotten = self.others.iter().take_while(|(at, _)| now.since(*at) > MEMORY).count();
         let too_many = self.others.len().saturating_sub(HEARD_MAX);
         self.others.drain(..forgotten.max(too_many));
+    }
+
+    /// No poll is sent before.
+    pub(super) fn polls_from(&self) -> Time {
+        self.polls_from
+    }
+
+    /// What is asked next cannot wait.
+    pub(super) fn hurry(&mut self) {
+        self.polls_from = Time::default();
     }
 
     /// What is wrong with the line, for people.
@@ -127,16 +145,29 @@ impl Bus {
         }
     }
 
-    /// Until when the device of the request that ends now is to be left alone, since it was not waited for as
-    /// long as it may take: as long as the line would be silent otherwise. At random a little longer, or what
-    /// disturbs the line at regular times might meet it again and again.
-    pub(super) fn rests_until(&self, reply: &Reply) -> Option<Time> {
+    /// Until when the device of the request that ends now without an answer is to be left alone: until the line
+    /// has been silent for its late answer, or would have been, if the device was not waited for as long as it may
+    /// take. At random a little longer, or what disturbs the line at regular times might meet it again and again.
+    pub(super) fn silence_behind(&self, reply: &Reply) -> Option<Silence> {
         let (request, timeout) = self.line.asked.as_ref()?;
-        let full = request.may_take?;
         let is_unanswered = !matches!(reply.result, Ok(_) | Err(RequestError::Exception(_)));
         // One that ended before its time is waited for by the line.
         let is_over = is_unanswered && self.now - reply.sent_at >= *timeout;
-        is_over.then(|| reply.sent_at + full * 2 + TRANSMITTING + at_random(self.now, full / 2))
+        if !is_over || request.is_probe || matches!(self.link, Link::Tcp { .. }) {
+            return None;
+        }
+        let (of_line, silent_until, full) = match request.may_take {
+            Some(full) => (self.now, reply.sent_at + full * 2 + TRANSMITTING, full),
+            None => (self.now + *timeout, self.now + *timeout, *timeout),
+        };
+        Some(Silence { of_line, of_device: silent_until + at_random(self.now, full / 2) })
+    }
+
+    /// A poll was lost, and the line is silent until then. What is polled next goes a little later than it could, at
+    /// random: a wait and the silence behind it last as long as those before them, so the line itself may be in step with
+    /// what disturbs it, and lose whatever it begins with, whoever is asked.
+    pub(super) fn leave_the_step(&mut self, silent_until: Time) {
+        self.line.polls_from = silent_until + at_random(self.now, self.response_timeout / 2);
     }
 
     /// Devices have got other numbers.
@@ -169,7 +200,7 @@ impl Bus {
 }
 
 /// A part of `spread`: the middle of a product with a large odd number is as good as random.
-fn at_random(now: Time, spread: Duration) -> Duration {
+pub(super) fn at_random(now: Time, spread: Duration) -> Duration {
     let part = (now.0.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as u32 % 1000;
     spread * part / 1000
 }

@@ -444,14 +444,15 @@ impl Bus {
         }
         self.look_for_others(&reply);
         self.look_for_signs(in_flight.device, &reply);
-        let rests_until = in_flight.device.zip(self.rests_until(&reply));
+        let silence = in_flight.device.zip(self.silence_behind(&reply));
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         // Before anything more is asked on it.
         self.renew_used_connection();
         self.renew_silent_connection();
         self.request_ended(in_flight, reply.result);
-        if let Some((device, until)) = rests_until {
-            self.devices[device].rest_until(until);
+        if let Some((device, silence)) = silence {
+            self.devices[device].rest_until(silence.of_device);
+            self.leave_the_step(silence.of_line);
         }
     }
 

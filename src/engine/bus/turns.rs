@@ -146,6 +146,7 @@ impl Bus {
         let now = self.now;
         let due = self.askable().find_map(|(index, device)| Some((index, device.feed_due(now, late)?)));
         let Some((device, read)) = due else { return false };
+        self.line.hurry();
         self.poll(device, self.devices[device].read_call(read));
         if let Some(in_flight) = &mut self.in_flight {
             in_flight.out_of_turn = true;
@@ -232,12 +233,15 @@ impl Bus {
             _ => false,
         };
         let timeout = state.timeout(self.response_timeout, is_well_known);
-        let not_before = state.asked(self.now);
+        let mut not_before = state.asked(self.now);
         let commanded_at = match purpose {
             Purpose::Command => self.active.as_mut().and_then(|active| active.came_at.take()),
             _ => None,
         };
         let request = state.request(self.now, call, timeout);
+        if is_poll {
+            not_before = not_before.max(self.line.polls_from());
+        }
         self.in_flight = Some(InFlight {
             device: Some(device),
             purpose,

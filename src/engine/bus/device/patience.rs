@@ -1,12 +1,13 @@
 //! How a silent device is asked: seldom and cheaply, and yet soon enough after its return.
 
+use super::super::line::at_random;
 use crate::engine::time::{Duration, Time};
 
 /// So many requests in a row without an answer, and a device counts as offline.
 pub(super) const FAILURES_UNTIL_OFFLINE: u32 = 3;
 /// The longest pause between two attempts: with the attempt itself, what a device's return may take to
 /// be noticed is 15 seconds.
-const PAUSE_LONGEST: Duration = Duration::from_millis(14_400);
+const PAUSE_LONGEST: Duration = Duration::from_millis(14_200);
 /// A pause is so many times as long as what it follows: a silent device makes the others some 2.3 % slower, as
 /// far as [`PAUSE_LONGEST`] lets it. Of the 3 % that it may cost, the rest is for what is not foreseen here.
 const SHARE: u32 = 44;
@@ -33,8 +34,14 @@ const SIGNS_APART_LONGEST: u32 = 256;
 const FULL_PROBE_FROM: u32 = 64;
 /// And at the latest after so many, which may be two hours.
 const FULL_PROBE_EACH: u32 = 512;
-/// Pauses differ by so many hundredths, so that two silent devices do not keep step.
-const JITTER_PERCENT: u32 = 3;
+/// Pauses differ at random, so that two silent devices do not keep step with each other, nor one with something
+/// that disturbs the line at regular times. One of a device that is there is shorter or longer by up to a half, to
+/// leave whatever spoils a third of the time;
+const SPREAD_PRESENT_PERCENT: u32 = 100;
+/// one of a device that is offline by up to a tenth, but never by more than this, or its share of the bus and the
+/// time of its return would not be kept.
+const SPREAD_OFFLINE_PERCENT: u32 = 20;
+const SPREAD_OFFLINE_LONGEST: Duration = Duration::from_millis(300);
 
 /// A device that is there and is asked the usual is waited for so many times its slowest answer lately,
 const HURRIED_FACTOR: u32 = 4;
@@ -153,17 +160,19 @@ impl Patience {
         (taken * SHARE).min(PAUSE_LONGEST)
     }
 
-    /// How long to leave the device alone after a request in vain: 0.25 s, 0.5 s, 1 s, and so on up to
+    /// How long to leave the device alone after a request in vain: some 0.25 s, 0.5 s, 1 s, and so on up to
     /// what keeps it within its share of the bus. A probe that waited longer than most is followed by no
-    /// longer pause, or the device's return would be noticed late just then. `unit` makes the pauses of
-    /// several silent devices differ.
-    pub(super) fn pause(&self, full: Duration, demanded: Option<Duration>, unit: u8) -> Duration {
+    /// longer pause, or the device's return would be noticed late just then.
+    pub(super) fn pause(&self, now: Time, full: Duration, demanded: Option<Duration>) -> Duration {
         let short = self.short_probe(full, demanded);
         let usual = if self.slowest_answer.is_some() { short } else { (short + full) / 2 };
         let backoff = Duration::from_millis(125 << self.failures.min(8));
-        let longest = Patience::pause_after(usual + FRAME);
-        let jitter = (self.failures.wrapping_mul(7) + u32::from(unit) * 5) % (JITTER_PERCENT + 1);
-        backoff.min(longest) * (100 - jitter) / 100
+        let pause = backoff.min(Patience::pause_after(usual + FRAME));
+        let spread = match self.is_probing() {
+            false => pause * SPREAD_PRESENT_PERCENT / 100,
+            true => (pause * SPREAD_OFFLINE_PERCENT / 100).min(SPREAD_OFFLINE_LONGEST),
+        };
+        pause - spread / 2 + at_random(now, spread)
     }
 }
 
@@ -212,7 +221,7 @@ mod tests {
         for _ in 0..probes {
             let took = patience.timeout(FULL, None) + FRAME;
             patience.unanswered();
-            let pause = patience.pause(FULL, None, 7);
+            let pause = patience.pause(Time::default() + asked + left, FULL, None);
             (asked, left, longest) = (asked + took, left + pause, longest.max(took + pause));
         }
         (asked.as_secs_f64() / left.as_secs_f64(), longest)
@@ -226,7 +235,7 @@ mod tests {
         {
             let (cost, longest) = cost(known, from, probes);
             assert!(cost <= 0.025, "{known:?} {from} {probes}: {cost}");
-            let return_within = if known.is_some() { 1_700 } else { 14_100 };
+            let return_within = if known.is_some() { 1_820 } else { 14_250 };
             // A full probe comes late itself, once in minutes.
             let longest = if probes > 50 && known.is_some() { longest - FULL } else { longest };
             assert!(longest <= Duration::from_millis(return_within), "{known:?}: {longest:?}");
@@ -293,13 +302,14 @@ mod tests {
     }
 
     #[test]
-    fn pauses_double_and_differ_from_device_to_device() {
-        let pauses = |unit: u8| -> Vec<u128> {
-            (1..=4).map(|failures| silent(failures, None).pause(FULL, None, unit).as_millis()).collect()
-        };
-        for (pause, doubled) in pauses(0).into_iter().zip([250, 500, 1000, 2000]) {
-            assert!((doubled * 97 / 100..=doubled).contains(&pause), "{pause} {doubled}");
+    fn pauses_double_and_differ_from_time_to_time() {
+        for (failures, doubled, spread) in [(1, 250, 250), (2, 500, 500), (3, 1000, 200), (4, 2000, 300)] {
+            let pauses: Vec<u64> = (0..100)
+                .map(|time| silent(failures, None).pause(Time(time * 37_411), FULL, None).as_millis() as u64)
+                .collect();
+            let (shortest, longest) = (pauses.iter().min(), pauses.iter().max());
+            assert!(pauses.iter().all(|pause| (doubled - spread / 2..=doubled + spread / 2).contains(pause)));
+            assert!(longest.zip(shortest).is_some_and(|(long, short)| long - short > spread * 8 / 10));
         }
-        assert_ne!(pauses(1), pauses(2));
     }
 }

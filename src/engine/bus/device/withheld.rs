@@ -9,6 +9,7 @@ use crate::engine::modbus::RequestError;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::Missing;
 
+use super::super::line::at_random;
 use super::patience::FAILURES_UNTIL_OFFLINE;
 use super::{Context, DeviceState, Presence, Severity, Span};
 
@@ -22,6 +23,10 @@ pub(super) const PAUSE_BUSY_LONG: Duration = Duration::from_secs(2);
 /// A read without an answer is left alone for so long, then for twice as long, and so on.
 const PAUSE_UNANSWERED: Duration = Duration::from_secs(5);
 const PAUSE_UNANSWERED_LONGEST: Duration = Duration::from_secs(60);
+/// One that has been answered since the device connected is rather disturbed than unknown to the device: at first it is
+/// left alone for so long only, so many times.
+const PAUSE_DISTURBED: Duration = Duration::from_secs(2);
+const DISTURBED_MAX: u32 = 6;
 
 /// The reads that are withheld now; of most devices none.
 #[derive(Clone, Debug, Default)]
@@ -36,6 +41,8 @@ struct WithheldRead {
     since: Time,
     /// Times in a row without an answer that could be used.
     failures: u32,
+    /// Has been answered since the device connected.
+    was_answered: bool,
 }
 
 impl Withheld {
@@ -44,10 +51,10 @@ impl Withheld {
         self.reads.clear();
     }
 
-    fn read(&mut self, span: Span, poll: Poll, now: Time) -> &mut WithheldRead {
+    fn read(&mut self, span: Span, poll: Poll, was_answered: bool, now: Time) -> &mut WithheldRead {
         let known = self.reads.iter().position(|read| (read.span, read.poll) == (span, poll));
         let at = known.unwrap_or_else(|| {
-            self.reads.push(WithheldRead { span, poll, since: now, failures: 0 });
+            self.reads.push(WithheldRead { span, poll, since: now, failures: 0, was_answered });
             self.reads.len() - 1
         });
         &mut self.reads[at]
@@ -64,10 +71,16 @@ impl Withheld {
 }
 
 impl WithheldRead {
-    /// How long to leave it alone, once it has failed as often as a device may.
-    fn pause(&self) -> Option<Duration> {
-        let doublings = self.failures.checked_sub(FAILURES_UNTIL_OFFLINE)?;
-        Some((PAUSE_UNANSWERED * (1 << doublings.min(8))).min(PAUSE_UNANSWERED_LONGEST))
+    /// How long to leave it alone, once it has failed as often as a device may; a little more or less at random, or
+    /// what disturbs it at regular times might do so each time.
+    fn pause(&self, now: Time) -> Option<Duration> {
+        let tries = self.failures.checked_sub(FAILURES_UNTIL_OFFLINE)?;
+        let disturbed = if self.was_answered { DISTURBED_MAX } else { 0 };
+        let pause = match tries.checked_sub(disturbed) {
+            None => PAUSE_DISTURBED,
+            Some(doublings) => (PAUSE_UNANSWERED * (1 << doublings.min(8))).min(PAUSE_UNANSWERED_LONGEST),
+        };
+        Some(pause * 9 / 10 + at_random(now, pause / 5))
     }
 }
 
@@ -95,9 +108,10 @@ impl DeviceState {
             return;
         }
         let read = self.polls.shared_read(index);
-        let withheld = self.withheld.read(read.span, read.poll, now);
+        let was_answered = self.polls.has_been_answered(index);
+        let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
         withheld.failures += 1;
-        let Some(pause) = withheld.pause() else { return };
+        let Some(pause) = withheld.pause(now) else { return };
         if withheld.failures == FAILURES_UNTIL_OFFLINE {
             let text = format!(
                 "device {}: {}: {error}, {FAILURES_UNTIL_OFFLINE} times in a row, while it answers others; what \
@@ -113,7 +127,8 @@ impl DeviceState {
     pub(super) fn refused(&mut self, now: Time, index: usize, code: u8, context: &mut Context) {
         let read = self.polls.read(index).clone();
         if matches!(code, 5 | 6) {
-            let since = self.withheld.read(read.span, read.poll, now).since;
+            let was_answered = self.polls.has_been_answered(index);
+            let since = self.withheld.read(read.span, read.poll, was_answered, now).since;
             if now - since >= BUSY_LONG {
                 self.withhold(now, index, PAUSE_BUSY_LONG, &Missing::Exception(code), context);
             } else {
