@@ -25,10 +25,10 @@ const HEARD_MAX: usize = 1000;
 /// Units that are named.
 const UNITS_MAX: usize = 3;
 
-/// What is left alone behind a request without an answer, and until when.
+/// Until when no poll is sent behind a request without an answer, and nothing to the device.
 pub(super) struct Silence {
-    pub(super) of_line: Time,
-    pub(super) of_device: Time,
+    of_line: Time,
+    of_device: Time,
 }
 
 /// What was heard on the line beside the answers.
@@ -145,9 +145,10 @@ impl Bus {
         }
     }
 
-    /// Until when the device of the request that ends now without an answer is to be left alone: until the line
-    /// has been silent for its late answer, or would have been, if the device was not waited for as long as it may
-    /// take. At random a little longer, or what disturbs the line at regular times might meet it again and again.
+    /// What is left alone behind the request that ends now, if nobody answered it: the line until a late answer would
+    /// have come, and the device too, if it was not waited for as long as it may take. Each at random a little longer,
+    /// or what disturbs the line at regular times might meet it again and again: a wait and the silence behind it last
+    /// as long as those before them, so the line itself may lose whatever it begins with, whoever is asked.
     pub(super) fn silence_behind(&self, reply: &Reply) -> Option<Silence> {
         let (request, timeout) = self.line.asked.as_ref()?;
         let is_unanswered = !matches!(reply.result, Ok(_) | Err(RequestError::Exception(_)));
@@ -156,18 +157,24 @@ impl Bus {
         if !is_over || request.is_probe || matches!(self.link, Link::Tcp { .. }) {
             return None;
         }
-        let (of_line, silent_until, full) = match request.may_take {
-            Some(full) => (self.now, reply.sent_at + full * 2 + TRANSMITTING, full),
-            None => (self.now + *timeout, self.now + *timeout, *timeout),
-        };
-        Some(Silence { of_line, of_device: silent_until + at_random(self.now, full / 2) })
+        let some_of = |time: Duration| at_random(self.now, time);
+        Some(match request.may_take {
+            // Others are asked meanwhile, after no more than that.
+            Some(full) => Silence {
+                of_line: self.now + some_of(full / 2),
+                of_device: reply.sent_at + full * 2 + TRANSMITTING + some_of(full / 2),
+            },
+            None => {
+                let until = self.now + *timeout + some_of(*timeout / 2);
+                Silence { of_line: until, of_device: until }
+            }
+        })
     }
 
-    /// A poll was lost, and the line is silent until then. What is polled next goes a little later than it could, at
-    /// random: a wait and the silence behind it last as long as those before them, so the line itself may be in step with
-    /// what disturbs it, and lose whatever it begins with, whoever is asked.
-    pub(super) fn leave_the_step(&mut self, silent_until: Time) {
-        self.line.polls_from = silent_until + at_random(self.now, self.response_timeout / 2);
+    /// Leaves the line and the device alone.
+    pub(super) fn keep_silence(&mut self, device: usize, silence: &Silence) {
+        self.devices[device].rest_until(silence.of_device);
+        self.line.polls_from = silence.of_line;
     }
 
     /// Devices have got other numbers.

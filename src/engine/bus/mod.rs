@@ -451,8 +451,7 @@ impl Bus {
         self.renew_silent_connection();
         self.request_ended(in_flight, reply.result);
         if let Some((device, silence)) = silence {
-            self.devices[device].rest_until(silence.of_device);
-            self.leave_the_step(silence.of_line);
+            self.keep_silence(device, &silence);
         }
     }
 
