@@ -13,7 +13,7 @@ use crate::edge::bus_thread::{BusHandle, Threads};
 use crate::edge::clock::Clock;
 use crate::edge::files;
 use crate::edge::http::Http;
-use crate::edge::mqtt::{Broker, Deputy, Mailbox};
+use crate::edge::mqtt::{Broker, Mailbox};
 use crate::edge::plant::Plant;
 use crate::edge::reports::{Detail, Reporter, Watched};
 use crate::edge::runtime::Runtime;
@@ -98,7 +98,7 @@ impl App {
         plant.set_buses(buses.clone());
 
         let _inside = runtime.enter();
-        let broker = connect(&plant, secrets, clock, None);
+        let broker = connect(&plant, secrets, clock);
         let of_reporter = plant.clone();
         let reporter = Arc::new(Reporter::new(move || of_reporter.broker(), watched(&buses)));
         let http =
@@ -231,10 +231,10 @@ pub(super) fn end_buses(runtime: &Runtime, buses: Vec<Arc<BusHandle>>) {
 }
 
 /// Connects to the plant's broker. Only within a runtime.
-pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock, deputy: Option<Deputy>) -> Broker {
+pub(super) fn connect(plant: &Arc<Plant>, secrets: Secrets, clock: Clock) -> Broker {
     let of_route = plant.clone();
     let route = move |news| of_route.tell(news);
-    let broker = Broker::start(&plant.settings(), secrets, clock, plant.mailbox(), deputy, route);
+    let broker = Broker::start(&plant.settings(), secrets, clock, plant.mailbox(), route);
     plant.set_connection(broker.state());
     broker
 }
@@ -285,16 +285,14 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
             // What was taken back may be lost with a connection: then it is taken back at the next start.
             let settings = plant.settings();
             let since = settled.take_if(|(of, ..)| Arc::ptr_eq(of, &settings));
-            let (connects, looks) =
-                since.map_or((broker.connects, 0), |(_, connects, looks)| (connects, looks));
+            let (connects, looks) = since.map_or((broker.connects, 0), |(_, connects, looks)| (connects, looks));
             let looks = looks + u32::from(all_is_told && connects == broker.connects);
             if looks == LOOKS_UNTIL_STORED {
                 remember_topics(&plant, &state, BTreeSet::new());
             }
             settled = Some((settings, connects, looks));
         }
-        let is_news =
-            has_stirred || now >= tell_at || seen != Some([broker.client_id_taken, broker.state_denied]);
+        let is_news = has_stirred || now >= tell_at || seen != Some([broker.client_id_taken, broker.state_denied]);
         seen = Some([broker.client_id_taken, broker.state_denied]);
         if !is_news && reporter.all_respond().await {
             shutdown::feed_watchdog();

@@ -6,8 +6,7 @@ use std::sync::Arc;
 use anyhow::Context;
 
 use crate::edge::app::{
-    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, start_buses,
-    watch, watched,
+    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, start_buses, watch, watched,
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
@@ -128,7 +127,7 @@ impl App {
         self.plant.set_buses(buses.clone());
         self.keys = keys;
         let _inside = self.runtime.enter();
-        self.broker = Some(connect(&self.plant, secrets, self.clock, None));
+        self.broker = Some(connect(&self.plant, secrets, self.clock));
         self.reporter.replace(watched(&buses));
         Ok(())
     }
@@ -256,16 +255,11 @@ impl App {
     }
 
     fn reconnect(&mut self, secrets: Secrets) {
-        let mut deputy = None;
         if let Some(broker) = self.broker.take() {
-            let of_route = self.plant.clone();
-            let route = move |news| of_route.tell(news);
-            let settings = self.plant.settings();
-            deputy = self.runtime.block_on(broker.deputy(&settings.mqtt, secrets.clone(), route));
             self.runtime.block_on(broker.finish());
         }
         let _inside = self.runtime.enter();
-        self.broker = Some(connect(&self.plant, secrets, self.clock, deputy));
+        self.broker = Some(connect(&self.plant, secrets, self.clock));
     }
 
     fn exchange_http(&mut self, listener: Option<Bound>, listen: Option<&str>) -> anyhow::Result<()> {

@@ -10,7 +10,6 @@ use rustls::ClientConfig;
 use crate::edge::{files, tls};
 use crate::engine::settings::Mqtt;
 
-#[derive(Clone)]
 pub struct Secrets {
     password: Option<String>,
     tls: Option<Arc<ClientConfig>>,

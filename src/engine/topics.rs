@@ -128,25 +128,16 @@ impl Topics {
         format!("{}/bridge/response/{verb}", self.base)
     }
 
-    /// The filters of all that this gateway listens to: commands, its own state, since others may have told it,
-    /// and the markers of a handover.
+    /// The filters to subscribe to, so that everything [`Topics::parse`] knows arrives, and the gateway's own state.
     pub fn subscriptions(&self) -> Vec<String> {
-        self.commands().into_iter().chain([self.bridge_state(), self.handover()]).collect()
-    }
-
-    /// Where the gateway marks when another connection of its own takes its commands; not retained.
-    pub fn handover(&self) -> String {
-        format!("{}/bridge/handover", self.base)
-    }
-
-    /// The filters of everything that [`Topics::parse`] knows.
-    pub fn commands(&self) -> Vec<String> {
         let mut own = self.base.clone();
         for level in &self.layout.levels {
             own.push('/');
             own.push_str(if let Level::Fixed(text) = level { text } else { "+" });
         }
-        vec![format!("{own}/+/set"), format!("{own}/+/get"), format!("{}/bridge/request/+", self.base)]
+        let requests = format!("{}/bridge/request/+", self.base);
+        // Its own state too: others may have told it.
+        vec![format!("{own}/+/set"), format!("{own}/+/get"), requests, self.bridge_state()]
     }
 
     /// What a message on `topic` asks for; `None` if it is none of our business.

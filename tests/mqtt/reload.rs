@@ -8,7 +8,6 @@ use std::thread;
 
 use busker::edge::clock::Clock;
 use busker::engine::time::{Duration, Time};
-use serde_json::Value as Json;
 
 use crate::support::{Broker, Gateway, Received, Watcher, find};
 use crate::{json, over_tcp, remembered, simulation};
@@ -288,61 +287,6 @@ fn another_broker_or_another_base_topic_is_taken_without_a_restart() {
     assert!(topics_of(&all, "pump").is_empty());
     assert_eq!(gateway.get("/health").0, 200);
     assert!(gateway.terminate().success());
-}
-
-#[test]
-fn no_command_is_lost_or_comes_twice_while_the_connection_is_exchanged() {
-    const EXCHANGES: usize = 8;
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let line = format!("line: {{tcp: '{}'}}", port.address());
-    let watcher = Watcher::start(&broker, "watcher");
-    let before = text(&broker, &[&line], &[RELAYS]);
-    let gateway = Gateway::start_with(&before);
-    online(&watcher, &["relays"]);
-    watcher.forget();
-    let goes_on = std::sync::atomic::AtomicBool::new(true);
-    let count = thread::scope(|scope| {
-        let publishing = scope.spawn(|| {
-            let mut number = 0;
-            while goes_on.load(std::sync::atomic::Ordering::Relaxed) {
-                let wish = format!("{{\"value\":true,\"transaction\":{number}}}");
-                // Messages overtake others of another quality of service.
-                match number % 2 {
-                    0 => watcher.publish("busker/relays/relay_2/set", &wish),
-                    _ => watcher.publish_at_most_once("busker/relays/relay_2/set", &wish),
-                }
-                number += 1;
-                thread::sleep(std::time::Duration::from_millis(1));
-            }
-            number
-        });
-        for exchange in 0..EXCHANGES {
-            let keep_alive = format!("mqtt: {{keep_alive: {}s, ", 20 + exchange);
-            gateway.write(&before.replace("mqtt: {", &keep_alive));
-            gateway.reload(DONE);
-        }
-        watcher.wait_for("busker/bridge/state", "online");
-        goes_on.store(false, std::sync::atomic::Ordering::Relaxed);
-        publishing.join().expect("it publishes")
-    });
-    watcher.publish("busker/relays/relay_2/set", "{\"value\":true,\"transaction\":\"last\"}");
-    let transactions = || -> Vec<Json> {
-        let outcomes = watcher.payloads("busker/relays/relay_2/outcome");
-        outcomes.iter().map(|outcome| json(outcome)["transaction"].clone()).collect()
-    };
-    find(|| transactions().contains(&"last".into()).then_some(())).expect("the last one has an outcome");
-    find(|| (transactions().len() > count).then_some(())).unwrap_or_else(|| {
-        let told = transactions();
-        let lost: Vec<usize> = (0..count).filter(|number| !told.contains(&Json::from(*number))).collect();
-        panic!("of {count} commands these have no outcome: {lost:?}");
-    });
-    let mut told = transactions();
-    told.sort_by_key(Json::to_string);
-    let all = told.len();
-    told.dedup();
-    assert_eq!((told.len(), all), (count + 1, count + 1), "each has one outcome");
-    assert_eq!(gateway.get("/health").0, 200);
 }
 
 #[test]

@@ -72,11 +72,6 @@ impl Watcher {
         self.client.publish(topic, QoS::AtLeastOnce, false, payload).expect("there is room");
     }
 
-    /// The same without any confirmation.
-    pub fn publish_at_most_once(&self, topic: &str, payload: &str) {
-        self.client.publish(topic, QoS::AtMostOnce, false, payload).expect("there is room");
-    }
-
     pub fn publish_retained(&self, topic: &str, payload: &str) {
         self.client.publish(topic, QoS::AtLeastOnce, true, payload).expect("there is room");
     }

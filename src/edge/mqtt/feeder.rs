@@ -5,7 +5,6 @@ use std::sync::{Arc, Mutex};
 use rumqttc::{AsyncClient, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
 use tokio::sync::{mpsc, oneshot};
 
-use super::handover::{Handover, quality, tell_marker};
 use super::lock;
 use super::mailbox::Mailbox;
 use super::poller::Seen;
@@ -39,30 +38,6 @@ pub enum News {
         stale: Option<String>,
     },
 }
-
-/// What a message from the broker asks for, if it asks for something.
-pub(super) fn news_of(
-    topics: &Topics,
-    topic: &str,
-    payload: String,
-    retained: bool,
-    stale: Option<String>,
-) -> Option<News> {
-    match topics.parse(topic)? {
-        Incoming::Set { device, point } => {
-            let (device, point) = (device.to_string(), point.to_string());
-            Some(News::Set { device, point, payload, retained })
-        }
-        Incoming::Get { device, point } if !retained => {
-            Some(News::Get { device: device.to_string(), point: point.to_string() })
-        }
-        Incoming::Get { .. } => None,
-        Incoming::Request { verb } => {
-            Some(News::Request { verb: verb.to_string(), payload, retained, stale })
-        }
-    }
-}
-
 /// Feeds the library from the outbox and hands on what comes in.
 pub(super) struct Feeder<Tell> {
     pub client: AsyncClient,
@@ -83,14 +58,6 @@ pub(super) struct Feeder<Tell> {
     pub ending: bool,
     /// Whether it was told that others tell something else of this gateway's state.
     pub denied: bool,
-    /// The exchange of this connection for another one, or of another one for it.
-    pub handover: Arc<Mutex<Option<Arc<Handover>>>>,
-    /// Whether it takes commands, or somebody stands in for it; by quality of service.
-    pub hears: [bool; 2],
-    /// Whether it is the new connection of an exchange.
-    pub takes_over: bool,
-    /// Whether it has to tell where.
-    pub owes_marker: bool,
     pub tell: Tell,
 }
 
@@ -131,7 +98,6 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 state.connects += 1;
                 drop(state);
                 (self.connected, self.subscribed) = (true, false);
-                self.owes_marker = self.takes_over;
                 self.mailbox.outbox().connected();
                 self.told_up = Some(true);
                 (self.tell)(News::Up);
@@ -167,7 +133,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                     )),
                     (false, None) => None,
                 };
-                self.receive(&publish.topic, quality(publish.qos), payload, publish.retain, stale);
+                self.receive(&publish.topic, payload, publish.retain, stale);
             }
             Seen::Packet { packet: Packet::SubAck(answer), .. } => {
                 let codes = answer.return_codes.iter().zip(&self.filters);
@@ -187,14 +153,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
     }
 
     /// `stale` says why a command would be too old to be obeyed.
-    fn receive(
-        &mut self,
-        topic: &str,
-        quality: usize,
-        payload: String,
-        retained: bool,
-        stale: Option<String>,
-    ) {
+    fn receive(&mut self, topic: &str, payload: String, retained: bool, stale: Option<String>) {
         if topic == self.topics.bridge_state() {
             // What the broker has kept is followed by this gateway's own word.
             if !retained && !self.ending {
@@ -225,13 +184,6 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             }
             return;
         }
-        if topic == self.topics.handover() {
-            self.heard_marker(quality, &payload);
-            return;
-        }
-        if !retained && self.is_represented(quality) {
-            return;
-        }
         match self.topics.parse(topic) {
             Some(Incoming::Set { .. }) if !retained && stale.is_some() => {
                 let reason = stale.unwrap_or_default();
@@ -240,37 +192,17 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 let topic = topics::outcome_of(topic);
                 self.mailbox.outbox().push(Message::once(topic, outcome.to_json()));
             }
-            _ => {
-                if let Some(news) = news_of(&self.topics, topic, payload, retained, stale) {
-                    (self.tell)(news);
-                }
+            Some(Incoming::Set { device, point }) => {
+                let (device, point) = (device.to_string(), point.to_string());
+                (self.tell)(News::Set { device, point, payload, retained });
             }
-        }
-    }
-
-    /// Whether somebody stands in for this connection and takes the commands.
-    fn is_represented(&self, quality: usize) -> bool {
-        !self.hears[quality] && lock(&self.handover).as_ref().is_some_and(|handover| !handover.is_off())
-    }
-
-    fn heard_marker(&mut self, quality: usize, marker: &str) {
-        let Some(handover) = lock(&self.handover).clone() else { return };
-        if handover.silences(quality, marker, &self.tell) {
-            self.hears[quality] = false;
-        } else if self.takes_over && marker == handover.ends() {
-            self.hears[quality] = true;
-            if self.hears == [true; 2] {
-                self.takes_over = false;
-                *lock(&self.handover) = None;
+            Some(Incoming::Get { device, point }) if !retained => {
+                (self.tell)(News::Get { device: device.to_string(), point: point.to_string() });
             }
-        }
-    }
-
-    /// Tells where this connection takes over from who stands in for it.
-    fn mark(&mut self) {
-        let handover = lock(&self.handover).clone();
-        if let Some(handover) = handover.filter(|_| self.subscribed && self.owes_marker) {
-            self.owes_marker = tell_marker(&self.client, &handover.topic, &handover.ends()).is_err();
+            Some(Incoming::Request { verb }) => {
+                (self.tell)(News::Request { verb: verb.to_string(), payload, retained, stale });
+            }
+            Some(Incoming::Get { .. }) | None => {}
         }
     }
 
@@ -300,7 +232,6 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
             self.subscribed = self.client.try_subscribe_many(self.filters.iter().map(filter)).is_ok();
         }
-        self.mark();
         let mut outbox = self.mailbox.outbox();
         while let Some(message) = outbox.next_message(self.clock.now()) {
             let Manner { confirmed, retain } = outbox.manner(&message);

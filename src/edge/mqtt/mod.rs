@@ -2,7 +2,6 @@
 //! with what the outbox holds, and hands on what comes in.
 
 mod feeder;
-mod handover;
 mod losses;
 mod mailbox;
 mod poller;
@@ -15,7 +14,6 @@ use tokio::task::JoinHandle;
 
 use self::feeder::Feeder;
 pub use self::feeder::News;
-use self::handover::{Handover, StandIn};
 use self::losses::Ends;
 pub use self::mailbox::Mailbox;
 use self::poller::Poller;
@@ -35,9 +33,6 @@ const IN_FLIGHT: usize = 50;
 /// A device with a thousand points is announced in 215 kB. Larger than anything sane, since a packet
 /// above the limit ends the connection.
 const PACKET_BYTES_MAX: usize = 16 * 1024 * 1024;
-
-/// How often it is looked whether an exchange has come to its end.
-const ASK_EVERY: Duration = Duration::from_millis(5);
 
 /// How long the last messages may take when the program ends.
 const GOODBYE: Duration = Duration::from_secs(3);
@@ -68,14 +63,7 @@ pub struct Broker {
     state: BrokerState,
     goodbye: Option<oneshot::Sender<()>>,
     feeder: JoinHandle<()>,
-    topics: Topics,
-    handover: Arc<Mutex<Option<Arc<Handover>>>>,
-    /// For this connection, until it takes commands itself.
-    deputy: Option<Deputy>,
 }
-
-/// Takes commands for a connection that is exchanged, until the new one does.
-pub struct Deputy(StandIn);
 
 impl Broker {
     /// Connects, and goes on connecting. `tell` is called from the runtime and must not wait.
@@ -84,14 +72,10 @@ impl Broker {
         secrets: Secrets,
         clock: Clock,
         mailbox: Arc<Mailbox>,
-        deputy: Option<Deputy>,
         tell: impl Fn(News) + Send + 'static,
     ) -> Broker {
         let topics = Topics::of(&settings.mqtt);
-        let mut options = options(&settings.mqtt, &topics, secrets);
-        options.set_last_will(LastWill::new(topics.bridge_state(), OFFLINE, QoS::AtLeastOnce, true));
-        let handover = deputy.as_ref().map(|deputy| deputy.0.handover.clone());
-        let handover = Arc::new(Mutex::new(handover));
+        let options = options(&settings.mqtt, &topics, secrets);
         let client_id = options.client_id();
         let (client, event_loop) = AsyncClient::new(options, IN_FLIGHT);
         let state = Arc::new(Mutex::new(BrokerReport::default()));
@@ -123,7 +107,7 @@ impl Broker {
         let feeder = Feeder {
             client,
             clock,
-            topics: topics.clone(),
+            topics,
             status_topic: settings.home_assistant.status_topic.clone(),
             filters,
             former_states,
@@ -135,10 +119,6 @@ impl Broker {
             subscribed: false,
             ending: false,
             denied: false,
-            handover: handover.clone(),
-            hears: [deputy.is_none(); 2],
-            takes_over: deputy.is_some(),
-            owes_marker: false,
             tell,
         };
         let feeder = tokio::spawn(async move {
@@ -146,35 +126,7 @@ impl Broker {
             poller.abort();
         });
         let state = BrokerState { state, connection, mailbox, clock };
-        Broker { state, goodbye: Some(goodbye), feeder, topics, handover, deputy }
-    }
-
-    /// Lets somebody stand in for this connection, which is about to be exchanged for one with these settings and
-    /// the same topics. `None` where there is nothing to be lost, or nothing to be done about it. Only within a
-    /// runtime.
-    pub async fn deputy(
-        &self,
-        mqtt: &Mqtt,
-        secrets: Secrets,
-        tell: impl Fn(News) + Clone + Send + 'static,
-    ) -> Option<Deputy> {
-        if !self.state.report().connected {
-            return None;
-        }
-        // Where the last exchange has not come to its end, this connection takes no commands yet.
-        let is_over = async {
-            let takes_over = || lock(&self.handover).as_ref().is_some_and(|handover| !handover.is_off());
-            while takes_over() || self.deputy.as_ref().is_some_and(|deputy| !deputy.0.has_ended()) {
-                tokio::time::sleep(ASK_EVERY).await;
-            }
-        };
-        tokio::time::timeout(GOODBYE, is_over).await.ok()?;
-        let number = self.state.clock.now().0 ^ u64::from(std::process::id()) << 32;
-        let handover = Arc::new(Handover::new(&self.topics, number));
-        *lock(&self.handover) = Some(handover.clone());
-        let options = options(mqtt, &self.topics, secrets);
-        let stand_in = StandIn::start(options, &self.topics, handover, tell.clone());
-        stand_in.stands_in(tell).await.then_some(Deputy(stand_in))
+        Broker { state, goodbye: Some(goodbye), feeder }
     }
 
     pub fn state(&self) -> BrokerState {
@@ -219,6 +171,7 @@ fn options(mqtt: &Mqtt, topics: &Topics, secrets: Secrets) -> MqttOptions {
     // A command is for now: the broker shall not keep any for a gateway that is not there.
     options.set_clean_session(true);
     options.set_max_packet_size(PACKET_BYTES_MAX, PACKET_BYTES_MAX);
+    options.set_last_will(LastWill::new(topics.bridge_state(), OFFLINE, QoS::AtLeastOnce, true));
     secrets.enter(&mut options, mqtt);
     options
 }
