@@ -285,14 +285,16 @@ pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc
             // What was taken back may be lost with a connection: then it is taken back at the next start.
             let settings = plant.settings();
             let since = settled.take_if(|(of, ..)| Arc::ptr_eq(of, &settings));
-            let (connects, looks) = since.map_or((broker.connects, 0), |(_, connects, looks)| (connects, looks));
+            let (connects, looks) =
+                since.map_or((broker.connects, 0), |(_, connects, looks)| (connects, looks));
             let looks = looks + u32::from(all_is_told && connects == broker.connects);
             if looks == LOOKS_UNTIL_STORED {
                 remember_topics(&plant, &state, BTreeSet::new());
             }
             settled = Some((settings, connects, looks));
         }
-        let is_news = has_stirred || now >= tell_at || seen != Some([broker.client_id_taken, broker.state_denied]);
+        let is_news =
+            has_stirred || now >= tell_at || seen != Some([broker.client_id_taken, broker.state_denied]);
         seen = Some([broker.client_id_taken, broker.state_denied]);
         if !is_news && reporter.all_respond().await {
             shutdown::feed_watchdog();

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use anyhow::Context;
 
 use crate::edge::app::{
-    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, start_buses, watch, watched,
+    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, start_buses,
+    watch, watched,
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};

@@ -89,7 +89,11 @@ mod tests {
                 "0.10000000000000000000001",
                 Some("123456789012345678901234567890.50"),
             ),
-            (r#"{"value": 1, "transaction": {"b": 1E+400, "a" :[ ]}}"#, "1", Some(r#"{"b": 1E+400, "a" :[ ]}"#)),
+            (
+                r#"{"value": 1, "transaction": {"b": 1E+400, "a" :[ ]}}"#,
+                "1",
+                Some(r#"{"b": 1E+400, "a" :[ ]}"#),
+            ),
             (r#" {"transaction": {"a":[1]}, "value": "ON"}"#, "ON", Some(r#"{"a":[1]}"#)),
             (r#"{"value": true, "transaction": null}"#, "ON", Some("null")),
             (r#"{"value": false, "transaction": ""}"#, "OFF", Some(r#""""#)),

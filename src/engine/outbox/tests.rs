@@ -84,8 +84,7 @@ fn a_reconnect_sends_everything_again_and_online_after_it() {
     }
     once(&mut outbox, "busker/boiler/flow/outcome", "done");
     outbox.connected();
-    let expected: Vec<&str> =
-        EVERYTHING.into_iter().chain(["busker/boiler/flow/outcome done!"]).collect();
+    let expected: Vec<&str> = EVERYTHING.into_iter().chain(["busker/boiler/flow/outcome done!"]).collect();
     check_sent(&mut outbox, &expected);
 }
 
