@@ -199,6 +199,11 @@ devices: {{thermostat: {{profile: acme/thermostat, bus: line, unit: 19}}}}
         let told = succeed("read", &[&by_name[..], &[point]].concat());
         assert!(told.contains(wanted), "{told}");
     }
+    // What is made of a value is said.
+    let told = succeed("write", &[&by_name[..], &["setpoint", "22.48"]].concat());
+    assert_eq!(told, "setpoint  unchanged  the device holds 22.5  `22.48` is rounded to 22.5\n");
+    let told = succeed("write", &[&by_name[..], &["setpoint", "22.5"]].concat());
+    assert_eq!(told, "setpoint  unchanged  the device holds 22.5\n");
     simulation.end(Signal::TERM);
 
     // The setpoint was in the EEPROM, and nothing else.
