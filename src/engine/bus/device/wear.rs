@@ -15,31 +15,30 @@ const WRITE: u64 = 2 * DAY;
 #[derive(Clone, Debug)]
 pub(super) struct Wear {
     rules: Eeprom,
+    account: Account,
+    /// While points are being written: how the account was before, and how many they are.
+    writing: Option<(Account, u64)>,
+    /// The points of which a value waits until they may be written again.
+    pub(super) waiting: Vec<PointIndex>,
+}
+
+/// What writes have taken.
+#[derive(Clone, Debug)]
+struct Account {
     written_at: BTreeMap<PointIndex, Time>,
     /// What is left of the budget. Half of a day's writes fit into it, and half of them come in during a
     /// day, a little each microsecond: so no 24 hours see more than the whole, and no clock is needed
     /// that tells when a day begins.
     left: u64,
     left_at: Time,
-    /// The points of which a value waits until they may be written again.
-    pub(super) waiting: Vec<PointIndex>,
-    /// The points that are being written, and how all was before.
-    writing: Vec<PointIndex>,
-    before: Option<Box<Wear>>,
 }
 
 impl Wear {
     /// A device that may be written as often as its `rules` say.
     pub(super) fn new(rules: Eeprom) -> Wear {
-        Wear {
-            rules,
-            written_at: BTreeMap::new(),
-            left: Wear::full(rules),
-            left_at: Time::default(),
-            waiting: Vec::new(),
-            writing: Vec::new(),
-            before: None,
-        }
+        let (left, left_at) = (Wear::full(rules), Time::default());
+        let account = Account { written_at: BTreeMap::new(), left, left_at };
+        Wear { rules, account, writing: None, waiting: Vec::new() }
     }
 
     fn full(rules: Eeprom) -> u64 {
@@ -49,42 +48,41 @@ impl Wear {
     /// Goes on with so many writes taken out of the budget, after a restart. (What is left would not do: the
     /// budget may be another one by then.)
     pub(super) fn recall(&mut self, writes_spent: u32) {
-        self.left = Wear::full(self.rules).saturating_sub(u64::from(writes_spent) * WRITE);
+        self.account.left = Wear::full(self.rules).saturating_sub(u64::from(writes_spent) * WRITE);
     }
 
     /// The point is being written, perhaps with others.
     pub(super) fn spend(&mut self, now: Time, point: PointIndex) {
-        if self.writing.is_empty() {
-            self.before = Some(Box::new(Wear { before: None, ..self.clone() }));
+        match &mut self.writing {
+            Some((_, points)) => *points += 1,
+            none => *none = Some((self.account.clone(), 1)),
         }
-        self.writing.push(point);
-        self.written_at.insert(point, now);
-        self.left = self.left(now).saturating_sub(WRITE);
-        self.left_at = now;
+        let left = self.left(now).saturating_sub(WRITE);
+        self.account.written_at.insert(point, now);
+        (self.account.left, self.account.left_at) = (left, now);
     }
 
     /// The write has ended; how many points' EEPROM it wore out. One that the device has not carried out was none.
     pub(super) fn end(&mut self, is_carried_out: bool) -> u64 {
-        let writing = std::mem::take(&mut self.writing);
-        match self.before.take() {
-            Some(before) if !is_carried_out => {
-                let Wear { written_at, left, left_at, .. } = *before;
-                (self.written_at, self.left, self.left_at) = (written_at, left, left_at);
+        match self.writing.take() {
+            Some((before, _)) if !is_carried_out => {
+                self.account = before;
                 0
             }
-            _ => writing.len() as u64,
+            Some((_, points)) => points,
+            None => 0,
         }
     }
 
     /// From when on the point may be written, as far as its own interval goes.
     pub(super) fn allowed_at(&self, point: PointIndex) -> Time {
-        self.written_at.get(&point).map_or(Time::default(), |at| *at + self.rules.interval)
+        self.account.written_at.get(&point).map_or(Time::default(), |at| *at + self.rules.interval)
     }
 
     /// From when on the device's budget allows another write.
     pub(super) fn budget_at(&self) -> Time {
-        let missing = WRITE.saturating_sub(self.left);
-        self.left_at + Duration::from_micros(missing.div_ceil(u64::from(self.rules.daily.max(1))))
+        let missing = WRITE.saturating_sub(self.account.left);
+        self.account.left_at + Duration::from_micros(missing.div_ceil(u64::from(self.rules.daily.max(1))))
     }
 
     /// Why nothing may be written now: the budget is spent.
@@ -106,9 +104,9 @@ impl Wear {
     }
 
     fn left(&self, now: Time) -> u64 {
-        let passed = now.since(self.left_at).as_micros() as u64;
+        let passed = now.since(self.account.left_at).as_micros() as u64;
         let refilled = passed.saturating_mul(u64::from(self.rules.daily));
-        self.left.saturating_add(refilled).min(Wear::full(self.rules))
+        self.account.left.saturating_add(refilled).min(Wear::full(self.rules))
     }
 }
 
