@@ -42,7 +42,7 @@ impl DeviceState {
     ) {
         let details = self.details(point);
         let (span, at, poll) = (details.at.span, details.at, details.poll);
-        self.tell_anyway.push(point);
+        self.told.want(point);
         if words.is_empty() {
             let missing = codec::resolve(self.device(), point, self.known()).err();
             self.values.lose(point, missing.unwrap_or(Missing::NotYetRead));
@@ -64,7 +64,7 @@ impl DeviceState {
         match error {
             RequestError::Exception(code) => {
                 self.values.lose(point, Missing::Exception(*code));
-                self.tell_anyway.push(point);
+                self.told.want(point);
                 self.tell(now, point, context);
                 self.after_news(now, context);
             }

@@ -9,6 +9,14 @@ use crate::engine::time::Time;
 
 use super::{Context, DeviceState, Presence, Target};
 
+/// The targets of which a retained command was seen.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Retained {
+    warned_of: Vec<Target>,
+    /// As far as this connection has told.
+    at_the_broker: Vec<Target>,
+}
+
 impl DeviceState {
     pub(in crate::engine::bus) fn target_named(&self, name: &str) -> Option<Target> {
         let device = &self.settings.device;
@@ -147,19 +155,20 @@ impl DeviceState {
 
     /// Whether this is the first retained command seen for the target.
     pub(in crate::engine::bus) fn warn_of_retained(&mut self, target: Target) -> bool {
-        if !self.retained_at_the_broker.contains(&target) {
-            self.retained_at_the_broker.push(target);
+        let Retained { warned_of, at_the_broker } = &mut self.retained;
+        if !at_the_broker.contains(&target) {
+            at_the_broker.push(target);
         }
-        let first = !self.warned_of_retained.contains(&target);
+        let first = !warned_of.contains(&target);
         if first {
-            self.warned_of_retained.push(target);
+            warned_of.push(target);
         }
         first
     }
 
     /// The connection is new: the broker tells again which retained commands it holds.
     pub(in crate::engine::bus) fn forget_retained(&mut self) {
-        self.retained_at_the_broker.clear();
+        self.retained.at_the_broker.clear();
     }
 
     /// Why an empty message on a `set` topic is no value. It is what deletes a retained one, and who had
@@ -176,8 +185,8 @@ impl DeviceState {
         if !may_be_empty {
             return Some("an empty message is no value; it only deletes a retained one");
         }
-        let at = self.retained_at_the_broker.iter().position(|other| *other == target)?;
-        self.retained_at_the_broker.swap_remove(at);
+        let at = self.retained.at_the_broker.iter().position(|other| *other == target)?;
+        self.retained.at_the_broker.swap_remove(at);
         Some("an empty message deletes the retained one; sent once more, it is an empty text")
     }
 
@@ -265,7 +274,7 @@ impl DeviceState {
                 self.want(point);
             } else {
                 // Told even if unchanged, so that a switch flips back that was moved in vain.
-                self.tell_anyway.push(point);
+                self.told.want(point);
                 self.tell(now, point, context);
             }
         }

@@ -26,7 +26,7 @@ impl DeviceState {
     /// Without points and things, which are most of it.
     pub(in crate::engine::bus) fn summary(&self, now: Time) -> DeviceReport {
         let device = &self.settings.device;
-        let online = self.told_available == Some(true);
+        let online = self.told.is_available();
         // It answers, but nothing is told before everything has been read once.
         let begins = (!online && self.presence == Presence::Present).then(|| "being read".to_string());
         DeviceReport {
@@ -102,8 +102,8 @@ impl DeviceState {
         };
         if let Some(event) = &point.event {
             // The bit itself means nothing; that it flipped does.
-            return match self.happened.get(&index) {
-                Some(at) => PointReport { value: event.clone(), read_at: Some(*at), ..told },
+            return match self.told.happened_at(index) {
+                Some(at) => PointReport { value: event.clone(), read_at: Some(at), ..told },
                 None => {
                     let missing = ("no_event", "not since the start".into());
                     PointReport { missing: Some(missing), ..told }

@@ -13,10 +13,6 @@ use crate::engine::value::Missing;
 use super::{Context, DeviceState, Target};
 
 impl DeviceState {
-    pub(in crate::engine::bus) fn unit(&self) -> u8 {
-        self.settings.unit
-    }
-
     pub(in crate::engine::bus) fn identity(&self) -> Option<&str> {
         self.identity.as_deref()
     }
@@ -242,7 +238,7 @@ impl DeviceState {
                 self.tell(now, *point, context);
             }
         }
-        if self.announced.is_some() {
+        if self.told.has_announced() {
             context.publish(self.announcement(context).message());
         }
         wanted
@@ -250,6 +246,6 @@ impl DeviceState {
 
     /// Whether the point still waits to be told although it may not have changed.
     pub(in crate::engine::bus) fn is_to_be_told(&self, point: PointIndex) -> bool {
-        self.tell_anyway.contains(&point)
+        self.told.is_wanted(point)
     }
 }

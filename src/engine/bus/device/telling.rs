@@ -1,17 +1,88 @@
 //! What a device tells: its values, whether it is there, what it is to Home Assistant, and why
 //! something is missing.
 
+use std::collections::BTreeMap;
+
 use serde_json::json;
 
 use crate::engine::codec;
-use crate::engine::device::{PointIndex, Poll, Thing};
+use crate::engine::device::{Device, PointIndex, Poll, Thing};
 use crate::engine::health::drift_json;
 use crate::engine::homeassistant::{self, Announcement, Outline};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::{Message, OFFLINE, ONLINE};
 use crate::engine::value::{Missing, Reading};
 
+use super::whole::Whole;
 use super::{Context, DeviceState, Presence};
+
+/// What the broker was last told of a device.
+pub(super) struct Told {
+    available: Option<bool>,
+    /// Without dates.
+    info: String,
+    info_at: Time,
+    /// The last info said that the device is there.
+    pub(super) present: bool,
+    announced: Option<Outline>,
+    pub(super) announcement_due: bool,
+    /// A `get` or a command wants these told even if they have not changed.
+    wanted: Vec<PointIndex>,
+    /// What each thing was last told to be, and when.
+    things: Vec<Option<(String, Time)>>,
+    /// When the points that tell events last did.
+    happened: BTreeMap<PointIndex, Time>,
+    pub(super) whole: Whole,
+}
+
+impl Told {
+    pub(super) fn nothing(device: &Device) -> Told {
+        Told {
+            available: None,
+            info: String::new(),
+            info_at: Time::default(),
+            present: false,
+            announced: None,
+            announcement_due: true,
+            wanted: Vec::new(),
+            things: vec![None; device.things.len()],
+            happened: BTreeMap::new(),
+            whole: Whole::default(),
+        }
+    }
+
+    /// The point is told next time even if it has not changed.
+    pub(super) fn want(&mut self, point: PointIndex) {
+        if !self.wanted.contains(&point) {
+            self.wanted.push(point);
+        }
+    }
+
+    pub(super) fn is_wanted(&self, point: PointIndex) -> bool {
+        self.wanted.contains(&point)
+    }
+
+    pub(super) fn is_anything_wanted(&self) -> bool {
+        !self.wanted.is_empty()
+    }
+
+    fn take_wanted(&mut self, point: PointIndex) -> bool {
+        let at = self.wanted.iter().position(|other| *other == point);
+        at.map(|at| self.wanted.remove(at)).is_some()
+    }
+
+    pub(super) fn is_available(&self) -> bool {
+        self.available == Some(true)
+    }
+
+    pub(super) fn has_announced(&self) -> bool {
+        self.announced.is_some()
+    }
+
+    pub(super) fn happened_at(&self, point: PointIndex) -> Option<Time> {
+        self.happened.get(&point).copied()
+    }
+}
 
 impl DeviceState {
     pub(super) fn tell_all(&mut self, now: Time, context: &mut Context) {
@@ -28,14 +99,13 @@ impl DeviceState {
         }
         if let Some(event) = &details.event {
             if self.values.take_flip(now, point) {
-                self.happened.insert(point, now);
+                self.told.happened.insert(point, now);
                 let topic = context.topics_of(&self.settings.name).state(&details.name);
                 context.publish(Message::once(topic, json!({"event_type": event}).to_string()));
             }
             return;
         }
-        let anyway = self.tell_anyway.contains(&point);
-        self.tell_anyway.retain(|other| *other != point);
+        let anyway = self.told.take_wanted(point);
         let again = self.told_again_after(details.poll, context.republish);
         if !anyway && !self.values.may_be_told(now, point, again) {
             return;
@@ -43,9 +113,9 @@ impl DeviceState {
         let before = self.values.told(point).map(Reading::to_string);
         if let Some(text) = self.values.tell(now, point, details, again, anyway) {
             if before.as_ref() == Some(&text) {
-                self.whole.is_told_again(now, context.republish);
+                self.told.whole.is_told_again(now, context.republish);
             } else {
-                self.whole.has_changed();
+                self.told.whole.has_changed();
             }
             let topic = context.topics_of(&self.settings.name).state(&details.name);
             context.publish(Message::retained(topic, text));
@@ -69,13 +139,14 @@ impl DeviceState {
                 continue;
             }
             let text = self.state_of(thing).unwrap_or("None");
-            let told = &mut self.told_things[index];
+            let Told { things, whole, .. } = &mut self.told;
+            let told = &mut things[index];
             let is_told = |(before, at): &(String, Time)| before == text && now - *at < context.republish;
             if !told.as_ref().is_some_and(is_told) {
                 if told.as_ref().is_some_and(|(before, _)| before == text) {
-                    self.whole.is_told_again(now, context.republish);
+                    whole.is_told_again(now, context.republish);
                 } else {
-                    self.whole.has_changed();
+                    whole.has_changed();
                 }
                 *told = Some((text.to_string(), now));
                 let topic = context.topics_of(&self.settings.name).state(&thing.name);
@@ -98,7 +169,7 @@ impl DeviceState {
 
     /// The thing is told again even if it has not changed.
     pub(in crate::engine::bus) fn want_thing(&mut self, thing: usize) {
-        self.told_things[thing] = None;
+        self.told.things[thing] = None;
         let states = &self.settings.device.things[thing].states;
         for point in states.iter().flat_map(|state| &state.row).map(|(point, _)| *point) {
             self.polls.want(point);
@@ -106,10 +177,10 @@ impl DeviceState {
     }
 
     pub(super) fn publish_availability(&mut self, available: bool, context: &mut Context) {
-        if self.told_available == Some(available) {
+        if self.told.available == Some(available) {
             return;
         }
-        self.told_available = Some(available);
+        self.told.available = Some(available);
         let topic = context.topics_of(&self.settings.name).availability();
         context.publish(Message::retained(topic, if available { ONLINE } else { OFFLINE }));
     }
@@ -120,20 +191,20 @@ impl DeviceState {
     }
 
     pub(super) fn announce(&mut self, context: &mut Context) {
-        self.announcement_due = false;
+        self.told.announcement_due = false;
         if !context.discovery {
             return;
         }
         let next = self.announcement(context);
-        if next.is_empty() && self.announced.is_none() {
+        if next.is_empty() && self.told.announced.is_none() {
             return;
         }
         let message = next.message();
         let outline = Outline::of(&next, &message);
-        if self.announced.as_ref() == Some(&outline) {
+        if self.told.announced.as_ref() == Some(&outline) {
             return;
         }
-        let previous = self.announced.replace(outline);
+        let previous = self.told.announced.replace(outline);
         if let Some(farewell) = previous.and_then(|previous| previous.farewell(&next)) {
             context.publish(farewell);
         }
@@ -147,7 +218,7 @@ impl DeviceState {
 
     /// Whether the info is as old as anything is told again.
     pub(super) fn info_is_old(&self, now: Time, context: &Context) -> bool {
-        now - self.told_info_at >= context.republish
+        now - self.told.info_at >= context.republish
     }
 
     /// What is known of the device beside its values. When each of them was last read belongs to it, and is
@@ -185,12 +256,12 @@ impl DeviceState {
         if self.settings.device.points.iter().any(|point| point.persistent) {
             info["eeprom"] = self.eeprom_json(now, context);
         }
-        self.told_present = self.presence == Presence::Present;
+        self.told.present = self.presence == Presence::Present;
         let without_dates = info.to_string();
-        if without_dates == self.told_info && !self.info_is_old(now, context) {
+        if without_dates == self.told.info && !self.info_is_old(now, context) {
             return;
         }
-        (self.told_info, self.told_info_at) = (without_dates, now);
+        (self.told.info, self.told.info_at) = (without_dates, now);
         info["last_read"] = self.dates_of_readings(context);
         context.publish(Message::retained(context.topics_of(&self.settings.name).info(), info.to_string()));
     }

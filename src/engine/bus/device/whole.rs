@@ -34,7 +34,7 @@ impl Whole {
 impl DeviceState {
     /// When the message is told, if something has changed.
     pub(in crate::engine::bus) fn whole_due_at(&self) -> Option<Time> {
-        self.whole.changed.then_some(self.whole.not_before)
+        self.told.whole.changed.then_some(self.told.whole.not_before)
     }
 
     /// Tells the message, if it is due.
@@ -42,7 +42,7 @@ impl DeviceState {
         if self.whole_due_at().is_none_or(|due| now < due) {
             return;
         }
-        self.whole = Whole { changed: false, not_before: now + INTERVAL, told_at: now };
+        self.told.whole = Whole { changed: false, not_before: now + INTERVAL, told_at: now };
         let topics = context.topics_of(&self.settings.name);
         context.publish(Message::retained(topics.json(), self.whole_json()));
     }

@@ -1,0 +1,153 @@
+//! What a device is asked next, and how long its answer may take.
+
+use crate::engine::identity;
+use crate::engine::modbus::{Call, Request};
+use crate::engine::schedule::{Outlook, Pace, Place, Polls, Urgency};
+use crate::engine::time::{Duration, Time};
+
+use super::{DeviceState, Presence};
+
+/// After a write a device is waited for fully for so long.
+const BUSY_AFTER_WRITE: Duration = Duration::from_secs(5);
+
+/// What the schedule wants from this device.
+pub(in crate::engine::bus) enum Polled {
+    Identification(Call),
+    Read(usize, Call),
+}
+
+/// Where a device stood before it was asked.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::engine::bus) struct Turn {
+    place: Option<Place>,
+    served_at: Time,
+}
+
+impl Turn {
+    /// It was asked out of turn.
+    pub(in crate::engine::bus) fn was_wanted(&self) -> bool {
+        self.place.is_some_and(|place| place.was_wanted())
+    }
+}
+
+impl DeviceState {
+    /// When it wants to be asked again.
+    pub(in crate::engine::bus) fn due_at(&self) -> Option<Time> {
+        let rested = self.paused_until.max(self.rested_at());
+        match self.presence {
+            Presence::Present => self.polls.due_at().map(|due| due.max(rested)),
+            _ => Some(rested),
+        }
+    }
+
+    /// Before, it wants silence. Others may be asked meanwhile.
+    fn rested_at(&self) -> Time {
+        self.last_answer_end + self.settings.device.wire.limits.delay
+    }
+
+    /// Whether something is due that only waits until the device has rested.
+    pub(in crate::engine::bus) fn only_rests(&self, now: Time) -> bool {
+        now < self.rested_at() && self.is_present() && self.polls.due_at().is_some_and(|due| due <= now)
+    }
+
+    /// How urgent its next question can be at most.
+    pub(in crate::engine::bus) fn outlook(&self, now: Time) -> Outlook {
+        let reads = if self.is_present() { self.polls.by_period(now) } else { None };
+        Outlook { not_before: self.paused_until.max(self.rested_at()), reads }
+    }
+
+    pub(in crate::engine::bus) fn most_urgent(&self, now: Time) -> Option<(Polled, Urgency)> {
+        self.next_question(now, Urgency::Wanted, |polls| polls.most_urgent(now))
+    }
+
+    /// What has waited longest, wanted at once or not, and for how many of its periods.
+    pub(in crate::engine::bus) fn longest_waiting(&self, now: Time) -> Option<(Polled, f64)> {
+        self.next_question(now, f64::INFINITY, |polls| polls.longest_waiting(now))
+    }
+
+    /// Its identification, if that is not known, which is as urgent as `of_identification`; or the read that
+    /// `of_polls` finds.
+    fn next_question<U>(
+        &self,
+        now: Time,
+        of_identification: U,
+        of_polls: impl FnOnce(&Polls) -> Option<(usize, U)>,
+    ) -> Option<(Polled, U)> {
+        if now < self.paused_until || now < self.rested_at() {
+            return None;
+        }
+        if self.presence != Presence::Present {
+            if let Some(call) = self.identification_call() {
+                return Some((Polled::Identification(call), of_identification));
+            }
+        }
+        let (index, urgency) = of_polls(&self.polls)?;
+        // After a request in vain another one than the most urgent: it may be that read alone which gets no answer.
+        // After two, where it seems to be in step with what disturbs it: then it is asked twice in a row.
+        let asks_other_after = if self.polls.is_in_step(index) { 2 } else { 1 };
+        let other = (self.patience.failures() % 3 == asks_other_after).then(|| self.polls.oldest(now));
+        Some((self.read_call(other.flatten().unwrap_or(index)), urgency))
+    }
+
+    pub(in crate::engine::bus) fn read_call(&self, index: usize) -> Polled {
+        Polled::Read(index, Call::Read(self.span_of(index)))
+    }
+
+    fn identification_call(&self) -> Option<Call> {
+        self.settings.device.identify.as_ref().map(identity::question)
+    }
+
+    /// Returns what its turn was before.
+    pub(in crate::engine::bus) fn begin_read(&mut self, read: usize, now: Time, pace: &mut Pace) -> Turn {
+        Turn { place: Some(self.polls.begin(read, now, pace)), ..self.turn() }
+    }
+
+    pub(in crate::engine::bus) fn turn(&self) -> Turn {
+        Turn { place: None, served_at: self.served_at }
+    }
+
+    /// The read that had begun never was on the wire.
+    pub(in crate::engine::bus) fn take_back(&mut self, read: usize, before: Turn) {
+        self.served_at = before.served_at;
+        if let Some(place) = before.place {
+            self.polls.take_back(read, place);
+        }
+    }
+
+    /// The device is being asked: returns the time before which nothing may be sent.
+    pub(in crate::engine::bus) fn asked(&mut self, now: Time) -> Time {
+        self.served_at = now;
+        now.max(self.rested_at())
+    }
+
+    /// How long the next request may wait for its answer; less where it is known how quick that is, for the
+    /// reads of [`DeviceState::is_well_known`].
+    pub(in crate::engine::bus) fn timeout(&mut self, of_bus: Duration, is_well_known: bool) -> Duration {
+        let demanded = self.settings.device.wire.response_timeout;
+        self.full_timeout = demanded.unwrap_or(of_bus).max(of_bus);
+        match is_well_known && !self.patience.is_probing() {
+            true => self.patience.hurried_timeout(self.full_timeout, demanded),
+            false => self.patience.timeout(self.full_timeout, demanded),
+        }
+    }
+
+    /// Whether it is known how long the device takes for this read. One that has just been written to may
+    /// still be busy with its EEPROM.
+    pub(in crate::engine::bus) fn is_well_known(&self, read: usize, now: Time) -> bool {
+        self.polls.is_well_known(read) && now >= self.busy_until
+    }
+
+    pub(in crate::engine::bus) fn request(&mut self, now: Time, call: Call, timeout: Duration) -> Request {
+        if call.is_write() {
+            self.busy_until = now + BUSY_AFTER_WRITE;
+        }
+        let is_probe = self.patience.is_probing();
+        Request {
+            unit: self.settings.unit,
+            call,
+            any_exception: self.settings.device.wire.quirks.exception_function_varies,
+            is_probe,
+            may_take: Some(self.full_timeout).filter(|full| !is_probe && timeout < *full),
+        }
+    }
+}
