@@ -23,15 +23,18 @@
 //! * Where the line is known to do so, what comes back must be what was sent. If it is not, another spoke
 //!   at the same time: no reply to that request is believed, it may be the other's.
 
-use std::collections::BTreeMap;
+mod echo;
+mod ending;
+mod overdue;
 
 use crate::engine::modbus::pdu;
-use crate::engine::modbus::rtu_bytes::{
-    Beginning, Sorted, Unanswered, beginning, expected_length, frame, late_reply, sort,
-};
-use crate::engine::modbus::{Answer, Discarded, LateReply, Reply, Request, RequestError, RequestsOfOthers};
+use crate::engine::modbus::rtu_bytes::{Beginning, beginning, expected_length, frame, late_reply, sort};
+use crate::engine::modbus::{Answer, Discarded, Reply, Request, RequestError};
 use crate::engine::settings::Line;
 use crate::engine::time::{Duration, Time};
+
+use echo::Echo;
+use overdue::Overdue;
 
 /// A silence that ends a damaged frame of full length. Adapters hand bytes over late: the FTDI
 /// latency timer is 16 ms.
@@ -43,22 +46,10 @@ const SILENCE_INSIDE_A_FRAME: Duration = Duration::from_millis(100);
 const TURNAROUND: Duration = Duration::from_millis(100);
 /// A line that is never silent is spoken on after this, or it would be lost for good.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// A request unanswered for longer gets no answer any more.
-const LATE_MAX: Duration = Duration::from_secs(10);
-/// A unit whose reply came late is given so much of its lateness more, in halves, but never more than as
-/// long again.
-const LATENESS_HALVES: u32 = 3;
-/// After a probe the line is silent for twice as long as that unit has come late, but never longer than this.
-const QUARANTINE_AFTER_PROBE_MAX: Duration = Duration::from_millis(500);
 /// The longest frame (2.5.1.1).
 const FRAME_MAX: u32 = 256;
 /// What is heard beyond this without a frame in it is noise.
 const HEARD_MAX: usize = 2048;
-/// After so many requests in a row that did not come back the adapter may be another one, on which noise
-/// before a reply is not a damaged echo.
-const ECHOES_MISSED_MAX: u32 = 3;
-/// As many bytes without any frame are a damaged reply rather than noise.
-const DAMAGED_MIN: u32 = 4;
 
 /// One serial line. For each request: [`Guard::begin`], wait for [`Guard::earliest_send`], send
 /// [`Guard::frame`], [`Guard::sent`]; then whatever comes first of bytes and [`Guard::wake_at`],
@@ -77,16 +68,10 @@ pub struct Guard {
     /// When each byte of `heard` came.
     heard_at: Vec<Time>,
     echo: Echo,
-    /// Requests in a row that did not come back although the line returns what we send.
-    echoes_missed: u32,
     /// When the last byte was on the wire, in either direction.
     busy_until: Option<Time>,
     quarantine_until: Option<Time>,
-    /// Units that are not asked before, although others are.
-    resting: BTreeMap<u8, Time>,
-    unanswered: Vec<Unanswered>,
-    /// How late each unit's latest reply came, behind the timeout that was asked for.
-    lateness: BTreeMap<u8, Duration>,
+    overdue: Overdue,
     discarded: Discarded,
 }
 
@@ -110,14 +95,6 @@ struct Waiting {
     looked_at: usize,
 }
 
-/// Whether this line returns what we send.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Echo {
-    Unknown,
-    Yes,
-    No,
-}
-
 /// A reply's place in what was heard.
 struct Found {
     start: usize,
@@ -139,13 +116,10 @@ impl Guard {
             frame: Vec::new(),
             heard: Vec::new(),
             heard_at: Vec::new(),
-            echo: Echo::Unknown,
-            echoes_missed: 0,
+            echo: Echo::default(),
             busy_until: None,
             quarantine_until: None,
-            resting: BTreeMap::new(),
-            unanswered: Vec::new(),
-            lateness: BTreeMap::new(),
+            overdue: Overdue::default(),
             discarded: Discarded::default(),
         }
     }
@@ -164,7 +138,7 @@ impl Guard {
             Err(reason) => Some(self.impossible(now, reason)),
             Ok(pdu) => {
                 self.frame = frame(request.unit, &pdu);
-                self.unanswered.retain(|late| now.since(late.at) < LATE_MAX);
+                self.overdue.give_up_old(now);
                 self.state = State::Begun { request: request.clone(), timeout, at: now };
                 None
             }
@@ -175,7 +149,7 @@ impl Guard {
     /// byte that comes before.
     pub fn earliest_send(&self, now: Time) -> Time {
         let (begun, rests_until) = match &self.state {
-            State::Begun { request, at, .. } => (*at, self.resting.get(&request.unit).copied()),
+            State::Begun { request, at, .. } => (*at, self.overdue.rests_until(request.unit)),
             _ => (now, None),
         };
         let quarantine = self.quarantine_until.max(rests_until).unwrap_or(begun);
@@ -195,11 +169,14 @@ impl Guard {
         };
         self.drop_strays(self.heard.len());
         self.quarantine_until = None;
-        self.resting.remove(&request.unit);
+        self.overdue.has_rested(request.unit);
         let transmitted_at = now + self.delay_before_send + self.line.characters(self.frame.len() as u32);
         self.busy_until = Some(transmitted_at);
-        let wait =
-            if request.unit == 0 { TURNAROUND } else { timeout + self.more_time(request.unit, timeout) };
+        let wait = if request.unit == 0 {
+            TURNAROUND
+        } else {
+            timeout + self.overdue.more_time(request.unit, timeout)
+        };
         let deadline = transmitted_at + wait;
         self.state = State::Waiting(Waiting {
             request,
@@ -281,11 +258,10 @@ impl Guard {
     pub fn link_lost(&mut self, now: Time, reason: &str) -> Option<Reply> {
         let state = std::mem::replace(&mut self.state, State::Idle);
         self.drop_strays(self.heard.len());
-        self.unanswered.clear();
-        self.resting.clear();
+        self.overdue.give_up_all();
         self.quarantine_until = None;
         self.busy_until = None;
-        self.echo = Echo::Unknown;
+        self.echo.forget();
         let sent_at = match state {
             State::Idle => return None,
             State::Begun { .. } => now,
@@ -301,7 +277,7 @@ impl Guard {
         let mut start = 0;
         loop {
             let found = self.reply_from(waiting, start, silent)?;
-            match late_reply(&self.heard[found.start..found.end], &self.unanswered, &late) {
+            match late_reply(&self.heard[found.start..found.end], self.overdue.requests(), &late) {
                 // A repeated write confirms the same either way.
                 Some((index, _)) if found.result != Ok(Answer::Written) => late.push(index),
                 _ => return Some(found),
@@ -313,8 +289,9 @@ impl Guard {
     /// The reply to believe when nothing more comes in time: one that could be late, but is the only
     /// one heard of its unit. Where there are more, they are late, and so may this one be.
     fn only_reply(&self, waiting: &Waiting) -> Option<Found> {
-        let late = sort(&self.heard, &self.frame, None, &self.unanswered).late;
-        let of_unit = late.iter().filter(|late| self.unanswered[**late].request.unit == waiting.request.unit);
+        let late = sort(&self.heard, &self.frame, None, self.overdue.requests()).late;
+        let of_unit =
+            late.iter().filter(|late| self.overdue.requests()[**late].request.unit == waiting.request.unit);
         if of_unit.count() > 1 { None } else { self.reply_from(waiting, 0, true) }
     }
 
@@ -348,7 +325,7 @@ impl Guard {
             return true;
         }
         let too_late = self.heard_at[last] > waiting.transmitted_at + SILENCE;
-        echoes == 0 && !too_late && self.echo != Echo::No
+        echoes == 0 && !too_late && self.echo.is_possible()
     }
 
     fn reply_looks_like_echo(&self, waiting: &Waiting) -> bool {
@@ -373,251 +350,22 @@ impl Guard {
     /// nothing was heard, the line may no longer return what we send.
     fn has_collided(&self, waiting: &Waiting, count: usize) -> bool {
         let heard = &self.heard[..count];
-        self.echo == Echo::Yes
+        self.echo.is_certain()
             && !heard.is_empty()
-            && sort(heard, &self.frame, Some(&waiting.request), &self.unanswered).discarded.echoes == 0
-    }
-
-    /// Our request was damaged on the line, and what was heard besides may be anybody's. What may still
-    /// come is waited for as after a timeout.
-    fn collided(&mut self, waiting: Waiting) -> Reply {
-        let sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
-        // What remained of our request is neither noise nor a damaged reply.
-        let discarded = Discarded { noise_bytes: 0, checksum_errors: 0, ..sorted.discarded };
-        self.account(&Sorted { discarded, ..sorted });
-        self.miss_echo();
-        self.await_reply(&waiting);
-        self.clear(self.heard.len());
-        self.state = State::Idle;
-        Reply::new(Err(RequestError::Collision), waiting.sent_at, None, &mut self.discarded)
-    }
-
-    /// What was heard ended the request before its time: until then its reply may come.
-    fn await_reply(&mut self, waiting: &Waiting) {
-        self.quarantine_until = Some(waiting.deadline);
-        if let Some(full) = waiting.request.may_take {
-            self.resting.insert(waiting.request.unit, waiting.transmitted_at + full);
-        }
-        self.remember(waiting, self.heard_at.last().copied().unwrap_or(waiting.deadline));
-    }
-
-    fn miss_echo(&mut self) {
-        self.echoes_missed += 1;
-        if self.echoes_missed >= ECHOES_MISSED_MAX {
-            self.echo = Echo::Unknown;
-            self.echoes_missed = 0;
-        }
-    }
-
-    /// The error that can be told before the deadline: a reply came, but damaged.
-    fn damaged_reply(&mut self, waiting: &Waiting) -> Option<Reply> {
-        let sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
-        let expected = expected_length(&waiting.request.call);
-        let alone = sorted.discarded.noise_bytes as usize == self.heard.len();
-        let looks_damaged = sorted.damaged > 0 || (alone && Some(self.heard.len()) == expected);
-        // A damaged echo begins like a damaged reply.
-        let echo_possible = self.echo != Echo::No && sorted.discarded.echoes == 0;
-        if !looks_damaged || (echo_possible && sorted.damaged <= self.frame.len()) {
-            return None;
-        }
-        // The reply may have been something else that only looked like it, unless it was all there.
-        if Some(sorted.damaged) != expected || echo_possible {
-            self.await_reply(waiting);
-        }
-        Some(self.failed(waiting.clone(), true))
-    }
-
-    /// The deadline has passed.
-    fn unanswered(&mut self, now: Time, waiting: Waiting) -> Reply {
-        let reply = self.failed(waiting.clone(), false);
-        let unit = waiting.request.unit;
-        let lateness = self.lateness.get(&unit).copied().unwrap_or_default();
-        let quarantine = match (waiting.request.is_probe, waiting.request.may_take) {
-            // Others are asked meanwhile: a late reply is known by its unit.
-            (_, Some(full)) => {
-                self.resting.insert(unit, waiting.transmitted_at + full * 2);
-                Duration::ZERO
-            }
-            (true, None) => {
-                let late = (lateness * 2).saturating_sub(self.more_time(unit, waiting.timeout));
-                late.min(QUARANTINE_AFTER_PROBE_MAX)
-            }
-            (false, None) => self.quarantine.unwrap_or(waiting.timeout),
-        };
-        self.quarantine_until = Some(now + quarantine);
-        self.remember(&waiting, now);
-        reply
-    }
-
-    /// How much longer than its timeout a unit is waited for.
-    fn more_time(&self, unit: u8, timeout: Duration) -> Duration {
-        let lateness = self.lateness.get(&unit).copied().unwrap_or_default();
-        (lateness * LATENESS_HALVES / 2).min(timeout)
-    }
-
-    fn remember(&mut self, waiting: &Waiting, at: Time) {
-        let transmitted_at = waiting.transmitted_at;
-        let due = transmitted_at + waiting.request.may_take.unwrap_or(waiting.timeout);
-        self.unanswered.push(Unanswered { request: waiting.request.clone(), transmitted_at, due, at });
-    }
-
-    /// Ends a request without an answer, with the error that what was heard amounts to.
-    fn failed(&mut self, waiting: Waiting, damaged: bool) -> Reply {
-        let mut sorted = sort(&self.heard, &self.frame, Some(&waiting.request), &self.unanswered);
-        let heard = &mut sorted.discarded;
-        if heard.checksum_errors == 0
-            && (damaged || heard.noise_bytes >= DAMAGED_MIN && heard.foreign_frames == 0)
-        {
-            heard.checksum_errors = 1;
-            heard.noise_bytes = 0;
-        }
-        let error = if heard.checksum_errors > 0 {
-            RequestError::Checksum
-        } else if heard.foreign_frames > 0 {
-            RequestError::WrongFrame
-        } else {
-            RequestError::Timeout
-        };
-        if heard.echoes > 0 && !self.reply_looks_like_echo(&waiting) {
-            self.echo = Echo::Yes;
-            self.echoes_missed = 0;
-        }
-        if heard.echoes == 0 && self.echo == Echo::Yes {
-            self.miss_echo();
-        }
-        self.account(&sorted);
-        let first = self.heard_at.first().copied();
-        let last = self.heard_at.last().copied();
-        self.clear(self.heard.len());
-        self.state = State::Idle;
-        Reply::new(Err(error), waiting.sent_at, first.zip(last), &mut self.discarded)
-    }
-
-    fn replied(&mut self, waiting: Waiting, found: Found) -> Reply {
-        if self.has_collided(&waiting, found.start) {
-            self.collided(waiting)
-        } else {
-            self.answered(waiting, found)
-        }
-    }
-
-    fn answered(&mut self, waiting: Waiting, found: Found) -> Reply {
-        let sorted = sort(&self.heard[..found.start], &self.frame, Some(&waiting.request), &self.unanswered);
-        let too_late_for_an_echo = self.heard_at[found.end - 1] > waiting.transmitted_at + SILENCE;
-        if sorted.discarded.echoes > 0 {
-            self.echo = Echo::Yes;
-            self.echoes_missed = 0;
-        } else if !self.reply_looks_like_echo(&waiting) || too_late_for_an_echo {
-            self.echo = Echo::No;
-        }
-        self.count(&sorted);
-        // Units answer in order: no request gets a reply any more that is older than the one answered.
-        // That may be an earlier write of the same; then this one still has its reply to come.
-        let bytes = &self.heard[found.start..found.end];
-        let earlier = late_reply(bytes, &self.unanswered, &sorted.late).map(|(index, _)| index);
-        let earlier = earlier.filter(|_| found.result == Ok(Answer::Written));
-        let until = earlier.unwrap_or(self.unanswered.len());
-        let unit = waiting.request.unit;
-        let over = self.unanswered.iter().enumerate().filter(|(index, late)| {
-            sorted.late.contains(index) || (late.request.unit == unit && *index <= until)
-        });
-        let over: Vec<usize> = over.map(|(index, _)| index).collect();
-        self.forget(&over);
-        if earlier.is_some() {
-            self.remember(&waiting, self.heard_at[found.end - 1]);
-        }
-        let times = (self.heard_at[found.start], self.heard_at[found.end - 1]);
-        self.clear(found.end);
-        self.state = State::Idle;
-        Reply::new(found.result, waiting.sent_at, Some(times), &mut self.discarded)
-    }
-
-    /// A broadcast has had its time.
-    fn obeyed(&mut self, waiting: Waiting) -> Reply {
-        if self.has_collided(&waiting, self.heard.len()) {
-            return self.collided(waiting);
-        }
-        let sent_at = waiting.sent_at;
-        let sorted = sort(&self.heard, &self.frame, None, &self.unanswered);
-        // Nobody replies, so a copy of the request can only be an echo.
-        self.echo = if sorted.discarded.echoes > 0 { Echo::Yes } else { Echo::No };
-        self.account(&sorted);
-        self.clear(self.heard.len());
-        self.state = State::Idle;
-        Reply::new(Ok(Answer::Written), sent_at, None, &mut self.discarded)
-    }
-
-    fn impossible(&mut self, now: Time, reason: &'static str) -> Reply {
-        Reply::new(Err(RequestError::Impossible(reason)), now, None, &mut self.discarded)
+            && sort(heard, &self.frame, Some(&waiting.request), self.overdue.requests()).discarded.echoes == 0
     }
 
     /// Between requests: a late reply ends the quarantine that waits for it.
     fn notice_late_reply(&mut self) {
         for at in 0..self.heard.len() {
-            if let Some((index, length)) = late_reply(&self.heard[at..], &self.unanswered, &[]) {
-                let late = &self.unanswered[index];
-                if let Some(heard_at) = self.heard_at.get(at + length - 1) {
-                    let lateness = self.lateness.entry(late.request.unit).or_default();
-                    *lateness = (*lateness).max(heard_at.since(late.due));
-                }
-                // The quarantine waits for the last one, and a unit's rest for that unit's last one.
-                if index + 1 == self.unanswered.len() {
+            if let Some((index, length)) = late_reply(&self.heard[at..], self.overdue.requests(), &[]) {
+                // The quarantine waits for the last one.
+                if self.overdue.hears(index, self.heard_at[at + length - 1]) {
                     self.quarantine_until = None;
-                }
-                let unit = late.request.unit;
-                if self.unanswered[index + 1..].iter().all(|later| later.request.unit != unit) {
-                    self.resting.remove(&unit);
                 }
                 self.drop_strays(at + length);
                 return;
             }
-        }
-    }
-
-    /// Counts and drops the first `count` bytes, which answer nothing that is asked now.
-    fn drop_strays(&mut self, count: usize) {
-        let sorted = sort(&self.heard[..count], &[], None, &self.unanswered);
-        self.account(&sorted);
-        self.clear(count);
-    }
-
-    fn clear(&mut self, count: usize) {
-        self.heard.drain(..count);
-        self.heard_at.drain(..count);
-    }
-
-    fn forget(&mut self, late: &[usize]) {
-        let mut index = 0;
-        self.unanswered.retain(|_| {
-            index += 1;
-            !late.contains(&(index - 1))
-        });
-    }
-
-    /// Counts what was heard beside an answer. Those whose late replies are in it owe nothing more.
-    fn account(&mut self, sorted: &Sorted) {
-        self.count(sorted);
-        self.forget(&sorted.late);
-    }
-
-    /// Before anything of it is forgotten.
-    fn count(&mut self, sorted: &Sorted) {
-        let more = sorted.discarded;
-        let sum = &mut self.discarded;
-        for (index, end) in sorted.late.iter().zip(&sorted.late_ends) {
-            let late = &self.unanswered[*index];
-            let after = self.heard_at[end - 1].since(late.transmitted_at);
-            sum.late = Some(LateReply { unit: late.request.unit, after });
-        }
-        sum.noise_bytes += more.noise_bytes;
-        sum.late_replies += more.late_replies;
-        sum.foreign_frames += more.foreign_frames;
-        sum.echoes += more.echoes;
-        sum.checksum_errors += more.checksum_errors;
-        let others = more.requests_of_others;
-        if others.count > 0 {
-            let count = sum.requests_of_others.count + others.count;
-            sum.requests_of_others = RequestsOfOthers { count, ..others };
         }
     }
 }
@@ -628,5 +376,4 @@ fn whole_micros(duration: Duration) -> Duration {
 }
 
 #[cfg(test)]
-#[path = "rtu_tests.rs"]
 mod tests;

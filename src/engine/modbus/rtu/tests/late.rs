@@ -87,5 +87,5 @@ fn a_quick_unit_that_does_not_answer_is_left_alone_while_others_are_asked() {
     assert_eq!(scene.guard.begin(scene.now, &two_inputs(), TIMEOUT), None);
     assert_eq!(scene.guard.earliest_send(scene.now), scene.now + whole_micros(LINE.frame_gap()));
     // It came within the time that it may take, so that it is waited for no longer than that.
-    assert_eq!(scene.guard.more_time(1, full), Duration::ZERO);
+    assert_eq!(scene.guard.overdue.more_time(1, full), Duration::ZERO);
 }
