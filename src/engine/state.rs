@@ -48,6 +48,8 @@ struct Value {
     told: Option<(Reading, Time)>,
     /// Has changed since it was last asked whether that is worth telling.
     is_news: bool,
+    /// It decides about others and has been written since it was read.
+    is_forgotten: bool,
 }
 
 /// What a read has brought.
@@ -85,6 +87,7 @@ impl Values {
             read_at: None,
             told: None,
             is_news: true,
+            is_forgotten: false,
         };
         Values {
             values: vec![unknown; count],
@@ -109,6 +112,13 @@ impl Values {
     /// What was last told of it.
     pub fn told(&self, point: PointIndex) -> Option<&Reading> {
         self.values[point].told.as_ref().map(|(reading, _)| reading)
+    }
+
+    /// Whether the device has been asked for it, or it is known why not; and it has not been written since, if it
+    /// decides about others.
+    pub fn is_settled(&self, point: PointIndex) -> bool {
+        let Value { reading, is_forgotten, .. } = &self.values[point];
+        !is_forgotten && !matches!(reading, Reading::Missing(Missing::NotYetRead | Missing::Offline))
     }
 
     pub fn read_at(&self, point: PointIndex) -> Option<Time> {
@@ -239,6 +249,7 @@ impl Values {
     pub fn forget_selector(&mut self, device: &Device, point: PointIndex) {
         if self.is_selector(point) {
             self.known[point] = None;
+            self.values[point].is_forgotten = true;
             self.meaning += 1;
             self.drop_dependents(device, point, &mut Vec::new());
         }
@@ -282,6 +293,7 @@ impl Values {
         let value = &mut self.values[point];
         let has_changed = before != value.reading;
         value.is_news |= has_changed;
+        value.is_forgotten = false;
         self.missing_changed |= (is_missing(&before) || is_missing(&value.reading)) && has_changed;
     }
 

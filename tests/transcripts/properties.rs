@@ -1,5 +1,7 @@
 //! Whatever happens to a bus, in whatever order: the promises that hold always.
 
+use std::collections::BTreeMap;
+
 use busker::engine::address::Span;
 use busker::engine::bus::{Action, Bus, Command, Event};
 use busker::engine::memory::Memories;
@@ -8,6 +10,7 @@ use busker::engine::profile::Library;
 use busker::engine::request::{Decision, Desk};
 use busker::engine::settings::{DeviceSettings, Settings};
 use busker::engine::time::{Date, Duration, Time};
+use busker::engine::topics::Message;
 use proptest::prelude::*;
 
 use crate::devices;
@@ -117,6 +120,11 @@ struct Observed {
     desk: Desk,
     requests: usize,
     responses: usize,
+    is_link_wanted: bool,
+    /// What each device was last told to be.
+    availability: BTreeMap<String, String>,
+    /// The device that was told to be online, and not yet more.
+    has_just_come: Option<String>,
 }
 
 impl Observed {
@@ -132,13 +140,54 @@ impl Observed {
                     self.in_flight = None;
                     self.bus.handle(self.now, Event::Withdrawn);
                 }
-                Action::Reopen { .. } => assert!(self.in_flight.is_none(), "a link ends under a request"),
+                Action::Reopen { .. } => {
+                    assert!(self.in_flight.is_none(), "a link ends under a request");
+                    self.is_link_wanted = true;
+                }
                 Action::Publish(message) if message.topic.ends_with("/outcome") => self.outcomes += 1,
                 Action::Publish(message) if message.topic.contains("/response/") => {
                     self.responses += usize::from(!message.payload.contains(r#""status":"progress""#));
                 }
+                Action::Publish(message) => self.look_at(&message),
                 _ => {}
             }
+        }
+    }
+
+    /// Who hears `online` finds the values: the info that is told with it knows of nothing that is still to be read.
+    fn look_at(&mut self, message: &Message) {
+        if let Some(device) = message.topic.strip_suffix("/availability") {
+            self.availability.insert(device.into(), message.payload.clone());
+            self.has_just_come = Some(device.into()).filter(|_| message.payload == "online");
+        }
+        if let Some(device) = message.topic.strip_suffix("/info") {
+            let info: serde_json::Value = serde_json::from_str(&message.payload).expect("JSON");
+            let is_online = self.availability[device] == "online";
+            assert_eq!(info["online"], is_online, "{device} {}", self.availability[device]);
+            assert_eq!(info["reason"].is_null(), is_online, "{}", message.payload);
+            if self.has_just_come.take().is_some_and(|came| came == device) {
+                let missing = info["missing"].as_object().expect("an object");
+                for reason in missing.values().filter_map(|reason| reason.as_str()) {
+                    let is_waited_for = reason.strip_prefix("waiting for ");
+                    let is_known =
+                        reason != "not yet read" && is_waited_for.is_none_or(|why| missing.contains_key(why));
+                    assert!(is_known, "{}", message.payload);
+                }
+            }
+        }
+    }
+
+    /// Answers everything for so long, and opens the link whenever it is wanted.
+    fn is_well_for(&mut self, time: Duration) {
+        let until = self.now + time;
+        while self.now < until {
+            while self.in_flight.is_some() || self.is_link_wanted {
+                self.end(&End::Words(1));
+                if std::mem::take(&mut self.is_link_wanted) {
+                    self.handle(Event::LinkUp);
+                }
+            }
+            self.play(&Happening::Time(500));
         }
     }
 
@@ -263,12 +312,21 @@ proptest! {
             requests: 0,
             responses: 0,
             leaving: Vec::new(),
+            is_link_wanted: false,
+            availability: BTreeMap::new(),
+            has_just_come: None,
             settings,
         };
         observed.take_actions();
         observed.play(&Happening::LinkUp);
         for happening in &happenings {
             observed.play(happening);
+        }
+        // Whatever has happened, who answers is online in the end.
+        observed.end(&End::Silence);
+        observed.is_well_for(Duration::from_secs(40));
+        for (device, availability) in &observed.availability {
+            prop_assert_eq!(availability, "online", "{}", device);
         }
         observed.handle(Event::Shutdown);
         for _ in 0..10 {

@@ -183,6 +183,11 @@ impl DeviceState {
         }
     }
 
+    /// The same for people: a device that is there is not online before everything has been read once.
+    fn why_not_online(&self) -> Option<String> {
+        self.reason().or_else(|| (!self.told.is_available()).then(|| "being read".into()))
+    }
+
     /// Whether its outputs fall to their safe state when nobody speaks to it, or writes to it.
     pub(super) fn wants_feeding(&self) -> bool {
         let device = &self.settings.device;

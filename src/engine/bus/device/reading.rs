@@ -101,23 +101,35 @@ impl DeviceState {
         self.polls.sleep(|read| read.points.iter().all(|(point, _)| sleeps(*point)));
     }
 
-    /// After a poll: what became complete with it is told.
+    /// After a poll: what became complete with it is told. The device is told to be there together with its
+    /// values, and not before: who waits for `online` looks at them next.
     pub(super) fn after_news(&mut self, now: Time, context: &mut Context) {
         self.tell_things(now, context);
-        if self.presence != Presence::Present {
+        if !self.is_present() || !self.polls.first_round_is_over() {
             return;
         }
-        if self.polls.first_round_is_over() {
-            if self.told.announcement_due {
-                self.announce(context);
+        if !self.told.is_available() {
+            if !self.is_known() {
+                return;
             }
-            self.publish_availability(true, context);
-            let drift_changed = self.keep_settings(now, context);
-            let is_news = self.values.take_missing_changed() || !self.told.present || drift_changed;
-            if is_news || self.info_is_old(now, context) {
-                self.tell_info(now, context);
-            }
+            self.tell_whole_at_once(now, context);
         }
+        if self.told.announcement_due {
+            self.announce(context);
+        }
+        self.publish_availability(true, context);
+        let drift_changed = self.keep_settings(now, context);
+        let is_news = self.values.take_missing_changed() || !self.told.present || drift_changed;
+        if is_news || self.info_is_old(now, context) {
+            self.tell_info(now, context);
+        }
+    }
+
+    /// Whether of all that is polled it is known what it says, or why it says nothing. What was read while that
+    /// which decides its meaning was not known is not: it is read again.
+    fn is_known(&self) -> bool {
+        let mut polled = self.settings.device.points.iter().enumerate().filter(|(_, point)| point.is_read());
+        polled.all(|(point, _)| self.values.is_settled(point))
     }
 
     pub(in crate::engine::bus) fn span_of(&self, read: usize) -> Span {

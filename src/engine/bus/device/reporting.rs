@@ -26,9 +26,6 @@ impl DeviceState {
     /// Without points and things, which are most of it.
     pub(in crate::engine::bus) fn summary(&self, now: Time) -> DeviceReport {
         let device = &self.settings.device;
-        let online = self.told.is_available();
-        // It answers, but nothing is told before everything has been read once.
-        let begins = (!online && self.presence == Presence::Present).then(|| "being read".to_string());
         DeviceReport {
             name: self.settings.name.clone(),
             title: self.settings.title.clone(),
@@ -36,8 +33,8 @@ impl DeviceState {
             manufacturer: device.manufacturer.clone(),
             model: device.model.clone(),
             unit: self.settings.unit,
-            online,
-            reason: self.reason().or(begins),
+            online: self.told.is_available(),
+            reason: self.why_not_online(),
             identity: self.identity.clone(),
             counters: self.counters,
             load: self.load.share(now),

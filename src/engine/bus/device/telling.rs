@@ -14,7 +14,7 @@ use crate::engine::topics::{Message, OFFLINE, ONLINE};
 use crate::engine::value::{Missing, Reading};
 
 use super::whole::Whole;
-use super::{Context, DeviceState, Presence};
+use super::{Context, DeviceState};
 
 /// What the broker was last told of a device.
 pub(super) struct Told {
@@ -224,6 +224,7 @@ impl DeviceState {
     /// What is known of the device beside its values. When each of them was last read belongs to it, and is
     /// no reason to tell it: so it is as of when this was told.
     pub(super) fn tell_info(&mut self, now: Time, context: &mut Context) {
+        let is_online = self.told.is_available();
         let missing: serde_json::Map<String, serde_json::Value> = self
             .settings
             .device
@@ -234,7 +235,7 @@ impl DeviceState {
             .filter_map(|(index, point)| match self.values.reading(index) {
                 // Nobody has asked for it.
                 Reading::Missing(Missing::NotYetRead) if point.is_read_on_request() => None,
-                Reading::Missing(missing) if self.presence == Presence::Present => {
+                Reading::Missing(missing) if is_online => {
                     Some((point.name.clone(), missing.to_string().into()))
                 }
                 _ => None,
@@ -247,8 +248,8 @@ impl DeviceState {
             "identity": self.identity,
             "bus": context.bus_name,
             "unit": self.settings.unit,
-            "online": self.presence == Presence::Present,
-            "reason": self.reason(),
+            "online": is_online,
+            "reason": self.why_not_online(),
             "missing": missing,
             "eeprom_writes": self.counters.persistent_writes,
             "drift": drift_json(&self.upkeep.drift()),
@@ -256,7 +257,7 @@ impl DeviceState {
         if self.settings.device.points.iter().any(|point| point.persistent) {
             info["eeprom"] = self.eeprom_json(now, context);
         }
-        self.told.present = self.presence == Presence::Present;
+        self.told.present = is_online;
         let without_dates = info.to_string();
         if without_dates == self.told.info && !self.info_is_old(now, context) {
             return;

@@ -1,5 +1,5 @@
 //! All values of a device in one message, for who wants them together: as they were told on their own
-//! topics, and not more often than once in a second.
+//! topics, and not more often than once in a second, but when the device comes.
 
 use crate::engine::device::ThingKind;
 use crate::engine::time::{Duration, Time};
@@ -39,9 +39,19 @@ impl DeviceState {
 
     /// Tells the message, if it is due.
     pub(in crate::engine::bus) fn tell_whole(&mut self, now: Time, context: &mut Context) {
-        if self.whole_due_at().is_none_or(|due| now < due) {
-            return;
+        if self.whole_due_at().is_some_and(|due| now >= due) {
+            self.publish_whole(now, context);
         }
+    }
+
+    /// Tells the message, if there is one, although the last may have been told just now.
+    pub(super) fn tell_whole_at_once(&mut self, now: Time, context: &mut Context) {
+        if context.json && self.told.whole.changed {
+            self.publish_whole(now, context);
+        }
+    }
+
+    fn publish_whole(&mut self, now: Time, context: &mut Context) {
         self.told.whole = Whole { changed: false, not_before: now + INTERVAL, told_at: now };
         let topics = context.topics_of(&self.settings.name);
         context.publish(Message::retained(topics.json(), self.whole_json()));
