@@ -34,10 +34,6 @@ struct Planned {
     is_repeated: bool,
     /// How often it has been answered since the device connected, as far as that is counted.
     answers: u8,
-    /// In a row it has not been answered by a device that answered others meanwhile.
-    lost: u8,
-    /// May be in step with what disturbs it, and is the next that is asked.
-    is_in_step: bool,
     /// Has been answered since the device connected, if only with an exception.
     tried: bool,
     /// Answered with an exception: not asked again before.
@@ -185,8 +181,6 @@ impl Polls {
             wanted_now: true,
             is_repeated: false,
             answers: 0,
-            lost: 0,
-            is_in_step: false,
             tried: false,
             paused_until: Time::default(),
             is_refused: false,
@@ -327,8 +321,6 @@ impl Polls {
     pub fn end(&mut self, index: usize) {
         self.reads[index].tried = true;
         self.reads[index].is_refused = false;
-        self.reads[index].lost = 0;
-        self.reads[index].is_in_step = false;
     }
 
     /// The read has brought what it asks for: that is counted.
@@ -350,31 +342,17 @@ impl Polls {
         self.reads[index].wanted_now = true;
     }
 
-    /// Nobody answered the read, for the moment: it is due at once, but goes before nothing that is more
-    /// overdue. A device that dies must not keep the line from all others until it counts as dead.
-    ///
-    /// If `others_are_answered` by that device, and only this read never, something may be in step with it:
-    /// then it is the next that is asked, after two, four, eight … times in vain. So seldom that one which is
-    /// never answered costs next to nothing.
-    pub fn try_again(&mut self, index: usize, now: Time, others_are_answered: bool) {
+    /// Nothing came of the read, for the moment. It is the next that is asked, if it `goes_first`; else it is due at
+    /// once, but goes before nothing that is more overdue: a device that dies must not keep the line from all
+    /// others until it counts as dead.
+    pub fn try_again(&mut self, index: usize, now: Time, goes_first: bool) {
         let planned = &mut self.reads[index];
         planned.answers = planned.answers.min(ANSWERS_WELL_KNOWN - ANSWERS_TO_FORGIVE);
-        // With nothing answered between, the device may be gone: that tells nothing.
-        if others_are_answered {
-            planned.lost = planned.lost.checked_add(1).unwrap_or(128);
-            planned.is_in_step = planned.lost >= 2 && planned.lost.is_power_of_two();
+        if planned.period.is_some() && !goes_first {
+            (planned.is_repeated, planned.began_at) = (true, Some(now));
+        } else {
+            planned.wanted_now = true;
         }
-        match planned.period {
-            Some(_) if !(others_are_answered && planned.is_in_step) => {
-                (planned.is_repeated, planned.began_at) = (true, Some(now))
-            }
-            _ => planned.wanted_now = true,
-        }
-    }
-
-    /// Whether the read that was asked in vain is to be the next that is asked all the same.
-    pub fn is_in_step(&self, index: usize) -> bool {
-        self.reads[index].is_in_step
     }
 
     /// Whether the read has brought anything since the device connected.
@@ -409,8 +387,6 @@ impl Polls {
             planned.wanted_now = true;
             planned.is_repeated = false;
             planned.answers = 0;
-            planned.lost = 0;
-            planned.is_in_step = false;
             planned.tried = false;
             planned.paused_until = Time::default();
             planned.is_refused = false;
@@ -471,8 +447,6 @@ impl Polls {
                 planned.wanted_now = before.wanted_now;
                 planned.is_repeated = before.is_repeated;
                 planned.answers = before.answers;
-                planned.lost = before.lost;
-                planned.is_in_step = before.is_in_step;
                 planned.tried = before.tried;
                 planned.paused_until = before.paused_until;
                 planned.is_refused = before.is_refused;

@@ -91,30 +91,13 @@ fn what_was_asked_in_vain_is_due_at_once_but_not_before_what_is_more_overdue() {
     })
     .collect();
     assert_eq!(order, [0, 1, 2]);
-}
-
-#[test]
-fn a_read_that_is_lost_again_and_again_while_others_are_answered_now_and_then_goes_first() {
-    let mut polls = polls(&[Poll::Fast, Poll::Fast]);
-    run(&mut polls, Duration::from_millis(5), Time::from_millis(5_000));
-    let mut went_first = Vec::new();
-    for time in 1..=20 {
-        let now = Time::from_millis(5_000 + time * 300);
-        polls.begin(0, now, &mut Pace::default());
-        polls.try_again(0, now, true);
-        if polls.most_urgent(now) == Some((0, Urgency::Wanted)) {
-            went_first.push(time);
-        }
-    }
-    assert_eq!(went_first, [2, 4, 8, 16]);
-    // Once it is answered, all is as it was; and of a device that answers nothing, nothing goes first.
-    polls.end(0);
-    for time in 1..=4 {
-        let now = Time::from_millis(12_000 + time * 300);
-        polls.begin(0, now, &mut Pace::default());
-        polls.try_again(0, now, time == 1);
-        assert_ne!(polls.most_urgent(now), Some((0, Urgency::Wanted)));
-    }
+    // Unless somebody knows that it has to go first; and what has no period has nothing to be due by.
+    polls.try_again(1, now, true);
+    assert_eq!(polls.most_urgent(now), Some((1, Urgency::Wanted)));
+    let mut polls = self::polls(&[Poll::Once]);
+    polls.begin(0, now, &mut Pace::default());
+    polls.try_again(0, now, false);
+    assert_eq!(polls.most_urgent(now).map(|(index, _)| index), Some(0));
 }
 
 #[test]

@@ -82,11 +82,15 @@ impl DeviceState {
             }
         }
         let (index, urgency) = of_polls(&self.polls)?;
-        // After a request in vain another one than the most urgent: it may be that read alone which gets no answer.
-        // After two, where it seems to be in step with what disturbs it: then it is asked twice in a row.
-        let asks_other_after = if self.polls.is_in_step(index) { 2 } else { 1 };
-        let other = (self.patience.failures() % 3 == asks_other_after).then(|| self.polls.oldest(now));
+        let other = self.asks_other_than(index).then(|| self.polls.oldest(now));
         Some((self.read_call(other.flatten().unwrap_or(index)), urgency))
+    }
+
+    /// After a request in vain another one than the most urgent is asked: it may be that read alone which gets no
+    /// answer. Not where it seems to be in step with what disturbs it: then it is asked twice in a row.
+    fn asks_other_than(&self, index: usize) -> bool {
+        let read = self.polls.read(index);
+        self.patience.failures() % 3 == 1 && !self.withheld.is_in_step(read.span, read.poll)
     }
 
     pub(in crate::engine::bus) fn read_call(&self, index: usize) -> Polled {

@@ -47,17 +47,6 @@ impl DeviceState {
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
                 self.failed(now, &error, context);
-                let is_unheard = matches!(
-                    error,
-                    RequestError::Timeout | RequestError::Unreachable(_) | RequestError::Link(_)
-                );
-                if self.is_present() {
-                    self.polls.try_again(index, now, self.patience.failures() == 1);
-                }
-                // It is there, and only its answer was spoilt.
-                if !(self.is_present() && is_unheard) {
-                    self.polls.want_again(index);
-                }
                 self.unanswered(now, index, &error, context);
             }
         }

@@ -11,7 +11,7 @@ use crate::engine::value::Missing;
 
 use super::super::line::at_random;
 use super::patience::FAILURES_UNTIL_OFFLINE;
-use super::{Context, DeviceState, Presence, Severity, Span};
+use super::{Context, DeviceState, Severity, Span};
 
 /// A read that the device answers with an exception is asked again after this.
 const PAUSE_EXCEPTION: Duration = Duration::from_secs(60);
@@ -27,6 +27,8 @@ const PAUSE_UNANSWERED_LONGEST: Duration = Duration::from_secs(60);
 /// left alone for so long only, so many times.
 const PAUSE_DISTURBED: Duration = Duration::from_secs(2);
 const DISTURBED_MAX: u32 = 6;
+/// One that has failed so often while others were answered may be in step with what disturbs it.
+const IN_STEP_AFTER: u32 = 2;
 
 /// The reads that are withheld now; of most devices none.
 #[derive(Clone, Debug, Default)]
@@ -58,6 +60,11 @@ impl Withheld {
             self.reads.len() - 1
         });
         &mut self.reads[at]
+    }
+
+    /// Whether something may be in step with the read, so that it fails whenever its turn comes.
+    pub(super) fn is_in_step(&self, span: Span, poll: Poll) -> bool {
+        self.reads.iter().any(|read| (read.span, read.poll) == (span, poll) && read.failures == IN_STEP_AFTER)
     }
 
     /// It has been given, or refused for good; whether it had been left without an answer for long.
@@ -95,8 +102,8 @@ impl DeviceState {
         }
     }
 
-    /// Nothing that can be used came for the read. If the device answers others, this one waits, and longer
-    /// each time.
+    /// Nothing that can be used came for the read. It is tried again; and if the device answers others, it waits,
+    /// and longer each time.
     pub(super) fn unanswered(
         &mut self,
         now: Time,
@@ -104,15 +111,22 @@ impl DeviceState {
         error: &RequestError,
         context: &mut Context,
     ) {
-        if self.presence != Presence::Present {
-            return;
+        if !self.is_present() {
+            return self.polls.want_again(index);
         }
         let read = self.polls.shared_read(index);
         let was_answered = self.polls.has_been_answered(index);
         let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
         withheld.failures += 1;
-        let Some(pause) = withheld.pause(now) else { return };
-        if withheld.failures == FAILURES_UNTIL_OFFLINE {
+        let (failures, pause) = (withheld.failures, withheld.pause(now));
+        let answers_others = self.patience.failures() == 1;
+        // Of the others the device is there, and only its answer was spoilt.
+        let is_unheard =
+            matches!(error, RequestError::Timeout | RequestError::Unreachable(_) | RequestError::Link(_));
+        let is_in_step = answers_others && failures == IN_STEP_AFTER;
+        self.polls.try_again(index, now, is_in_step || !is_unheard);
+        let Some(pause) = pause else { return };
+        if failures == FAILURES_UNTIL_OFFLINE {
             let text = format!(
                 "device {}: {}: {error}, {FAILURES_UNTIL_OFFLINE} times in a row, while it answers others; what \
                  stands there is told as missing, and asked for less often",
