@@ -65,8 +65,9 @@ fn a_write_is_waited_for_fully_and_so_are_the_reads_behind_it() {
     assert_eq!(world.late_replies(), 0);
 }
 
-/// Without the rule that what is lost again and again while others are answered now and then goes first, it is 16 s
-/// and more here: [`busker::engine::schedule::Polls::try_again`].
+/// 5.0 s are the longest here, and 6.3 s where the fault begins at other moments. Without the rule that what is lost twice
+/// in a row while others are answered is asked at once, it is up to 8.4 s. (That chance has its part in it is what the
+/// next test shows: without it, that one fails, and this one does not.)
 #[test]
 fn what_is_disturbed_in_step_with_the_polls_starves_no_reading() {
     for (units, poll) in [(1, "1ms"), (1, "50ms"), (1, "200ms"), (2, "50ms"), (4, "1ms"), (4, "200ms")] {
@@ -78,7 +79,7 @@ fn what_is_disturbed_in_step_with_the_polls_starves_no_reading() {
             world.run_until(from + Duration::from_secs(60));
             let longest = without_news(&world, from);
             let what = format!("{units} units, every {every}th request, each {poll}");
-            assert!(longest < Duration::from_secs(6), "{what}: {longest:?}");
+            assert!(longest < Duration::from_secs(7), "{what}: {longest:?}");
         }
     }
 }
