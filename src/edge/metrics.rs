@@ -40,6 +40,10 @@ pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
     denied.set(flag(report.broker.state_denied));
     let help = "Whether others tell something else of this gateway's state again and again";
     registry.register("broker_state_denied", help, denied);
+    let kept_back = OneGauge::default();
+    kept_back.set(report.broker.kept_back.len() as f64);
+    let help = "Topics that miss something, since the broker takes no message as long";
+    registry.register("broker_kept_back", help, kept_back);
     counter(&mut registry, "broker_connects", "Connections made", report.broker.connects);
     counter(&mut registry, "messages_dropped", "Messages that waited too long", report.broker.dropped);
 
@@ -327,6 +331,7 @@ mod tests {
             "busker_broker_connected 1.0",
             "busker_broker_client_id_taken 0.0",
             "busker_broker_state_denied 0.0",
+            "busker_broker_kept_back 0.0",
             "busker_bus_up{bus=\"cellar\"} 1.0",
             "busker_bus_load_ratio{bus=\"cellar\"} 0.25",
             "busker_bus_requests_total{bus=\"cellar\"} 12",

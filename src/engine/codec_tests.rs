@@ -321,6 +321,22 @@ fn what_is_made_of_a_wish_is_said() {
         let found = obey(&float.points[0], &write, &resolved, text).map(|obeyed| obeyed.words);
         assert_eq!(found, Ok(words(hex)), "{text}");
     }
+    // But where the profile gives it steps, they are its steps.
+    let quarters = WriteRule::Range {
+        min: Decimal::integer(-1000),
+        max: Decimal::integer(1000),
+        step: Some(Decimal { units: 25, decimals: 2 }),
+    };
+    let quarters = Write { rule: quarters, ..write.clone() };
+    for (text, hex, note) in [
+        ("0.3", "3E80 0000", Some("`0.3` is rounded to 0.25")),
+        ("-999.9", "C47A 0000", Some("`-999.9` is rounded to -1000")),
+        ("999.7500000000001", "4479 F000", None),
+        ("0.5", "3F00 0000", None),
+    ] {
+        let found = obey(&float.points[0], &quarters, &resolved, text);
+        assert_eq!(found, Ok(Obeyed { words: words(hex), note: note.map(str::to_string) }), "{text}");
+    }
     let found = obey(&float.points[0], &write, &resolved, "3.5e38");
     assert_eq!(found, Err("`3.5e38` is too large for the register".to_string()));
 }

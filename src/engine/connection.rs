@@ -7,6 +7,9 @@ use crate::engine::time::{Duration, Time};
 const PAUSE_FIRST: Duration = Duration::from_millis(500);
 const PAUSE_LAST: Duration = Duration::from_secs(30);
 
+/// A broker that closes the connection over a long message has done so at once, and lets us in again at once.
+const ATTEMPTS_CHOKED: u32 = 1;
+
 /// A connection that held this long was a good one: after it the pauses begin anew.
 const GOOD_AFTER: Duration = Duration::from_secs(10);
 
@@ -35,6 +38,8 @@ const LISTEN_AFTER_SILENCE: Duration = Duration::from_secs(1);
 pub enum Loss {
     /// The broker closed it.
     Closed,
+    /// The same while a long message was on its way to it, which it may not take.
+    Choked,
     /// Nothing came within a time limit.
     Silent,
     /// Anything else: refused, unreachable, not understood.
@@ -101,7 +106,7 @@ impl Connection {
                 self.thrown_out = if self.attempts_since_loss == 1 { self.thrown_out + 1 } else { 1 };
             }
             (Some(_), Loss::Closed) => self.thrown_out = 1,
-            (Some(_), Loss::Silent | Loss::Failed) => self.thrown_out = 0,
+            (Some(_), Loss::Choked | Loss::Silent | Loss::Failed) => self.thrown_out = 0,
             (None, _) => self.attempts_since_loss += 1,
         }
         if held.is_some() {
@@ -115,6 +120,10 @@ impl Connection {
         (self.asked_at, self.stale) = (None, None);
         let pause = pause(self.attempts, self.contested, seed);
         self.attempts += 1;
+        if loss == Loss::Choked {
+            // Which message that is, is found out in a few attempts.
+            self.attempts = self.attempts.min(ATTEMPTS_CHOKED);
+        }
         pause
     }
 
@@ -180,6 +189,17 @@ mod tests {
             let pause = connection.lost(at(2 + held), Loss::Failed, 0);
             assert_eq!(pause, Duration::from_millis(expected), "held {held} s");
         }
+    }
+
+    #[test]
+    fn while_it_is_found_out_which_message_is_too_long_the_pauses_stay_short_and_nobody_else_is_blamed() {
+        let (mut connection, mut pauses) = (Connection::default(), Vec::new());
+        for second in 0..8 {
+            connection.made(at(second * 2));
+            pauses.push(connection.lost(at(second * 2), Loss::Choked, 0).as_millis());
+        }
+        assert_eq!(pauses, [500, 1000, 1000, 1000, 1000, 1000, 1000, 1000]);
+        assert!(!connection.is_contested(at(20)));
     }
 
     /// `held`: how long each connection was, in seconds, with the broker reachable at once or only at

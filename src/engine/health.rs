@@ -329,6 +329,8 @@ pub struct BrokerReport {
     pub client_id_taken: bool,
     /// Others tell something else of this gateway's state, again and again.
     pub state_denied: bool,
+    /// Topics of which the broker is not told what stands there, since it takes no message as long.
+    pub kept_back: Vec<String>,
     /// Messages that wait for it: at most one for each retained topic, and those told once.
     pub waiting: usize,
     /// Messages told once that were dropped since too many waited.
@@ -378,6 +380,7 @@ impl GatewayReport {
             Status::Lost
         } else if self.broker.client_id_taken
             || self.broker.state_denied
+            || !self.broker.kept_back.is_empty()
             || devices.any(|device| !device.online)
             || self.buses.iter().any(|bus| bus.report.paused)
         {

@@ -9,6 +9,7 @@ mod manner;
 mod pace;
 mod queue;
 mod reconfigure;
+mod too_long;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -23,6 +24,8 @@ use former::Former;
 pub use former::Tree;
 use pace::Pace;
 use queue::{Lane, Queue, Queued};
+use too_long::TooLong;
+pub use too_long::may_be_too_long;
 
 /// Home Assistant subscribes to the states of a new entity only some time after it was announced,
 /// and takes no notice of what comes before (0.4 s were too short, 0.8 s long enough).
@@ -54,6 +57,7 @@ pub struct Outbox {
     retained: BTreeMap<Arc<str>, Retained>,
     queue: Queue,
     pace: Pace,
+    too_long: TooLong,
     dropped: u64,
     /// Counts the retained topics, to send them again in the order in which they first came.
     next_number: u64,
@@ -94,6 +98,7 @@ impl Outbox {
             retained: BTreeMap::new(),
             queue: Queue::default(),
             pace: Pace::default(),
+            too_long: TooLong::default(),
             dropped: 0,
             next_number: 0,
             states_due_at: None,
@@ -135,6 +140,7 @@ impl Outbox {
         loop {
             let Some(queued) = self.queue.pop_front() else { return self.next_left_behind() };
             match queued {
+                Queued::Once(message) if self.too_long.is(message.payload.len()) => self.dropped += 1,
                 Queued::Once(message) => return Some(*message),
                 Queued::Removal(topic) => return Some(Message::retained(topic, "")),
                 Queued::Newest(topic) => {
@@ -144,6 +150,9 @@ impl Outbox {
                             return Some(Message::retained(&*topic, ""));
                         }
                         entry.queued = false;
+                        if self.too_long.is(entry.payload.len()) {
+                            continue;
+                        }
                         return Some(Message::retained(&*topic, entry.payload.clone()));
                     }
                 }
@@ -198,7 +207,9 @@ impl Outbox {
                 Queued::Newest(_) | Queued::Removal(_) => {}
             }
         }
-        for topic in self.in_order(|_| true) {
+        let (last, topics): (Vec<Arc<str>>, Vec<Arc<str>>) =
+            self.in_order(|_| true).into_iter().partition(|topic| self.too_long.is_doubted(topic));
+        for topic in topics {
             // A farewell goes before the announcement that it prepares.
             let (before, rest) = once.into_iter().partition(|message| *message.topic == *topic);
             once = rest;
@@ -207,6 +218,7 @@ impl Outbox {
         }
         once.into_iter().for_each(|message| self.queue_last(Queued::Once(Box::new(message))));
         removals.into_iter().for_each(|topic| self.queue_last(Queued::Removal(topic)));
+        last.into_iter().for_each(|topic| self.queue_last(Queued::Newest(topic)));
         self.retained.values_mut().for_each(|entry| entry.queued = true);
         self.states_due_at = None;
     }
@@ -303,7 +315,7 @@ impl Outbox {
 
     fn lane(&self, topic: &str) -> Lane {
         match self.rank(topic) {
-            Rank::Bridge | Rank::Discovery => Lane::Announcements,
+            Rank::Bridge | Rank::Discovery if !self.too_long.is_doubted(topic) => Lane::Announcements,
             _ => Lane::Others,
         }
     }

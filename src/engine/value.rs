@@ -194,6 +194,8 @@ pub enum Missing {
     /// It held a text without a letter. Told as such it would be no value on MQTT: an empty message deletes what
     /// the broker keeps, and Home Assistant passes over it.
     EmptyText,
+    /// A thing's points say what is none of its states.
+    NoState,
     /// The register that counts seconds held 0, or more than there is a date for.
     NotAMoment,
     /// The device answered the read with this exception.
@@ -215,6 +217,7 @@ impl Missing {
             Missing::NotANumber => "not_a_number",
             Missing::NotText => "not_text",
             Missing::EmptyText => "empty_text",
+            Missing::NoState => "no_state",
             Missing::NotAMoment => "not_a_moment",
             Missing::Exception(_) => "exception",
             Missing::Unanswered(_) => "unanswered",
@@ -234,6 +237,7 @@ impl fmt::Display for Missing {
             Missing::NotANumber => write!(f, "not a number"),
             Missing::NotText => write!(f, "not a text"),
             Missing::EmptyText => write!(f, "an empty text"),
+            Missing::NoState => write!(f, "what its points say is none of its states"),
             Missing::NotAMoment => write!(f, "no date and time"),
             Missing::Exception(code) => write!(f, "exception {code}"),
             Missing::Unanswered(error) => write!(f, "{error}, again and again"),

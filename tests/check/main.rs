@@ -84,6 +84,13 @@ fn the_last_line_says_what_did_not_happen_only_where_something_was_to_happen() {
 }
 
 #[test]
+fn a_bus_without_devices_is_not_busy_and_the_zero_has_no_sign() {
+    let config = GOOD.replace("buses:\n", "buses:\n  attic: {tcp: \"127.0.0.1:1502\"}\n");
+    let told = text(&check(&config, &[]).stdout);
+    assert!(told.contains("\n  busy 0 % of the time; a command waits at most 0 ms"), "{told}");
+}
+
+#[test]
 fn warnings_do_not_fail() {
     let output = check(&GOOD.replace("/dev/serial/by-id/usb-A", "/dev/ttyUSB0"), &[]);
     assert_eq!(output.status.code(), Some(0));

@@ -3,6 +3,7 @@
 mod clients;
 mod faults;
 mod floods;
+mod limits;
 mod manners;
 mod neighbours;
 mod orphans;

@@ -88,6 +88,11 @@ impl Broker {
         self.start_again();
     }
 
+    /// Another configuration, from its next start on.
+    pub fn be_told(&mut self, extra: &str) {
+        self.extra = extra.into();
+    }
+
     /// The same after its end.
     pub fn start_again(&mut self) {
         assert!(self.launch(), "mosquitto starts again on port {}", self.port);

@@ -69,7 +69,8 @@ impl Budget {
 
     /// Seconds of wire that are wanted in a second; above 1 every period is longer by as much.
     pub fn load(&self) -> f64 {
-        let load = self.load_at(1.0);
+        // The sum of nothing is a negative zero.
+        let load = self.load_at(1.0) + 0.0;
         // Where feeding alone is too much, no stretch of the polls makes room for it.
         if load <= 1.0 || self.load_of_feeding() >= 1.0 { load } else { self.stretch() }
     }

@@ -102,7 +102,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.told_up = Some(true);
                 (self.tell)(News::Up);
             }
-            Seen::Down { reason, contested } => {
+            Seen::Down { reason, contested, closed_on } => {
                 let mut state = lock(&self.state);
                 state.connected = false;
                 // Once for each reason, not once for each attempt; and a quarrel once, not each time
@@ -116,6 +116,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 drop(state);
                 self.connected = false;
                 self.mailbox.outbox().listens_no_more();
+                self.judge_length(closed_on);
                 if self.told_up != Some(false) {
                     self.told_up = Some(false);
                     (self.tell)(News::Down);
@@ -149,6 +150,20 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.mailbox.outbox().listens(self.clock.now());
             }
             Seen::Packet { .. } | Seen::Room => {}
+        }
+    }
+
+    /// A broker that takes no message as long as the one which it was sent has no other word for that than to close
+    /// the connection.
+    fn judge_length(&self, closed_on: Option<(String, usize)>) {
+        let mut outbox = self.mailbox.outbox();
+        let Some((topic, bytes)) = closed_on else { return outbox.lost() };
+        if outbox.closed_on(&topic, bytes) {
+            tracing::warn!(
+                "the broker closes the connection whenever it is sent what belongs on `{topic}`, {bytes} bytes: most \
+                 likely it takes no message that long (`max_packet_size` of mosquitto). It is not sent again; the \
+                 topics that miss something stand under `kept_back` in `/health`"
+            );
         }
     }
 

@@ -53,6 +53,7 @@ impl BrokerState {
         let outbox = self.mailbox.outbox();
         (report.waiting, report.dropped) = (outbox.waiting(), outbox.dropped());
         report.state_denied = outbox.is_denied(self.clock.now());
+        report.kept_back = outbox.kept_back();
         drop(outbox);
         report
     }

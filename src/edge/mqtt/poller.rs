@@ -9,7 +9,8 @@ use super::lock;
 use super::losses::{Ends, loss};
 use crate::edge::clock::Clock;
 use crate::edge::secrets::Secrets;
-use crate::engine::connection::Connection;
+use crate::engine::connection::{Connection, Loss};
+use crate::engine::outbox::may_be_too_long;
 use crate::engine::settings::Mqtt;
 use crate::engine::time::Duration;
 use crate::engine::topics::Message;
@@ -79,18 +80,30 @@ impl Poller {
         }
         // A collision of packet numbers from the old connection would stop publishing for ever.
         let collided = self.event_loop.state.collision.take();
+        // What was on its way, and some of what would have been next.
+        let unconfirmed = self.event_loop.pending.iter().filter_map(|request| match request {
+            Request::Publish(publish) => Some(publish),
+            _ => None,
+        });
+        let longest = unconfirmed.max_by_key(|publish| publish.payload.len());
+        let longest = longest.map(|publish| (publish.topic.clone(), publish.payload.len()));
         let now = self.clock.now();
-        let (was_made, pause, contested) = {
+        let (was_made, pause, contested, closed_on) = {
             let mut connection = lock(&self.connection);
             let was_made = connection.is_made();
-            let pause = connection.lost(now, loss(&error), now.0);
-            (was_made, pause, connection.is_contested(now))
+            let closed_on = longest.filter(|_| was_made && loss(&error) == Loss::Closed);
+            let loss = match &closed_on {
+                Some((_, bytes)) if may_be_too_long(*bytes) => Loss::Choked,
+                _ => loss(&error),
+            };
+            let pause = connection.lost(now, loss, now.0);
+            (was_made, pause, connection.is_contested(now), closed_on)
         };
         let reason = match contested {
             true => self.ends.contested(),
             false => self.ends.reason(&error, was_made),
         };
-        self.seen.send(Seen::Down { reason, contested }).await?;
+        self.seen.send(Seen::Down { reason, contested, closed_on }).await?;
         tokio::time::sleep(pause).await;
         // Only now, when nobody hands over more: the library would send what it still holds before
         // anything newer, or drop it.
@@ -130,6 +143,8 @@ pub(super) enum Seen {
         reason: String,
         /// Somebody else takes this gateway's place again and again.
         contested: bool,
+        /// The longest message that the broker had not confirmed when it closed it, and its bytes.
+        closed_on: Option<(String, usize)>,
     },
     /// Messages told once that the library had taken and the broker has not.
     Unsent(Vec<Message>),
@@ -184,7 +199,7 @@ mod tests {
             let first = events.recv().await.expect("two things are told");
             assert!(matches!(first, Seen::Packet { packet, stale_for: None } if packet == command));
             let second = events.recv().await.expect("two things are told");
-            assert!(matches!(second, Seen::Down { reason, contested: false } if reason.contains("`id`")));
+            assert!(matches!(second, Seen::Down { reason, contested: false, .. } if reason.contains("`id`")));
             task.abort();
         });
     }

@@ -86,12 +86,25 @@ impl Bus {
                 return;
             }
         }
+        // What will never be written takes no other value's place.
+        if let Some((point, outcome)) = self.devices[device].refusal_of(target, &wish.text) {
+            if !self.is_being_written(device, point) {
+                self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
+            }
+            return self.tell_outcome(device, target, wish.of(outcome));
+        }
         let waiting = Waiting::new(self.now, device, target, wish, is_press);
         for (replaced, reason) in self.waiting.push(waiting) {
             let outcome = replaced.wanted.ended(OutcomeKind::Expired, reason);
             self.tell_outcome(replaced.device, replaced.target, outcome);
         }
         self.tell_what_waits(device);
+    }
+
+    /// Whether a write to the point is on its way, or not yet read back: what it holds is told behind that.
+    fn is_being_written(&self, device: usize, point: PointIndex) -> bool {
+        let mut begun = self.active.iter().chain(self.settling.iter().map(|settling| &settling.active));
+        begun.any(|active| active.device == device && active.flow.point() == point)
     }
 
     /// There is no such point, or its device is just being exchanged for what a new configuration says of it.

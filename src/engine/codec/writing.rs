@@ -26,8 +26,17 @@ pub fn obey(point: &Point, write: &Write, resolved: &Resolved<'_>, text: &str) -
     let note = match (end, &taken) {
         (Some(_), taken) => Some(format!("`{text}` is out of range, and {taken} the nearest value in it")),
         (None, Reading::Number(taken)) => {
-            let wanted = wished_number(text).ok().filter(|wanted| !is_noise(resolved, *wanted, *taken));
+            let wanted =
+                wished_number(text).ok().filter(|wanted| !is_noise(resolved.step(), *wanted, *taken));
             wanted.map(|_| format!("`{text}` is rounded to {taken}"))
+        }
+        (None, Reading::Float(taken)) => {
+            // A float is as exact as a float is: only a step of the profile moves it.
+            let wanted = wished_number(text).ok();
+            let stepped = wanted.and_then(|wanted| Some((wanted, stepped(resolved, &write.rule, wanted)??)));
+            let step = limits(resolved, &write.rule).and_then(|limits| limits.step);
+            let moved = stepped.filter(|(wanted, stepped)| !is_noise(step, *wanted, *stepped));
+            moved.map(|_| format!("`{text}` is rounded to {taken}"))
         }
         _ => None,
     };
@@ -65,8 +74,8 @@ fn wished_number(text: &str) -> Result<Decimal, String> {
 const TOO_LARGE: f64 = 1e29;
 
 /// Whether the two differ only by what a calculation with floats leaves: 21.400000000000002 is 21.4.
-fn is_noise(resolved: &Resolved<'_>, wanted: Decimal, taken: Decimal) -> bool {
-    let step = resolved.step().unwrap_or(Decimal::ONE).to_f64().abs();
+fn is_noise(step: Option<Decimal>, wanted: Decimal, taken: Decimal) -> bool {
+    let step = step.unwrap_or(Decimal::ONE).to_f64().abs();
     (wanted.to_f64() - taken.to_f64()).abs() <= step * 1e-6
 }
 
@@ -188,15 +197,8 @@ fn checked_number(
     let form = resolved.form;
     let wanted = wished_number(text)?;
     check_limits(resolved, rule, wanted, text)?;
-    let step = match rule {
-        WriteRule::Range { step: Some(_), .. } => limits(resolved, rule).and_then(|limits| limits.step),
-        _ => None,
-    };
     let overflow = || format!("`{text}` is too large");
-    let stepped = match (step, limits(resolved, rule)) {
-        (Some(step), Some(limits)) => nearest_step(wanted, step, limits).ok_or_else(overflow)?,
-        _ => wanted,
-    };
+    let stepped = stepped(resolved, rule, wanted).ok_or_else(overflow)?.unwrap_or(wanted);
     let above_offset = stepped.checked_add(form.offset.negated()).ok_or_else(overflow)?;
     let resolution = Decimal { units: form.scale.units, decimals: form.scale.decimals + resolved.shift };
     let raw = rounded_quotient(above_offset, resolution).ok_or_else(overflow)?;
@@ -214,6 +216,17 @@ fn checked_number(
         return Err(format!("`{text}` does not fit the register, which holds {low} to {high}"));
     }
     Ok(raw)
+}
+
+/// The nearest of the profile's steps, or `Some(None)` where it gives none; `None` for what is too large.
+fn stepped(resolved: &Resolved<'_>, rule: &WriteRule, wanted: Decimal) -> Option<Option<Decimal>> {
+    let limits = limits(resolved, rule);
+    match (rule, limits, limits.and_then(|limits| limits.step)) {
+        (WriteRule::Range { step: Some(_), .. }, Some(limits), Some(step)) => {
+            nearest_step(wanted, step, limits).map(Some)
+        }
+        _ => Some(None),
+    }
 }
 
 /// Steps are counted from the smallest value, as Home Assistant counts them, and none is beyond the largest.
@@ -264,9 +277,13 @@ fn rounded_quotient(number: Decimal, divisor: Decimal) -> Option<i128> {
 
 fn encode_float(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Result<Vec<u16>, String> {
     let form = resolved.form;
-    check_limits(resolved, rule, wished_number(text)?, text)?;
-    // A float holds what has too many digits for a decimal.
-    let wanted: f64 = text.trim().parse().map_err(|_| format!("`{text}` is not a number"))?;
+    let number = wished_number(text)?;
+    check_limits(resolved, rule, number, text)?;
+    let wanted: f64 = match stepped(resolved, rule, number) {
+        Some(Some(stepped)) => stepped.to_f64(),
+        // A float holds what has too many digits for a decimal.
+        _ => text.trim().parse().map_err(|_| format!("`{text}` is not a number"))?,
+    };
     if let Some(limits) = limits(resolved, rule) {
         if wanted < limits.min.to_f64() || wanted > limits.max.to_f64() {
             return Err(format!("`{text}` is outside {} to {}", limits.min, limits.max));

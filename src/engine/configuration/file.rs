@@ -16,7 +16,7 @@ use crate::engine::settings::{self, Layout, OnBrokerLoss, Parity};
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
 use crate::engine::value::Decimal;
-use crate::engine::yaml::{At, Content, Definitions, Faults, Json, Map, Node, Read, Scalar, record};
+use crate::engine::yaml::{At, Content, Definitions, Faults, Json, Map, Node, Place, Read, Scalar, record};
 
 record! {
     /// The configuration of one gateway.
@@ -25,8 +25,8 @@ record! {
         mqtt: Option<Part<Mqtt>>,
         /// How devices are announced to Home Assistant.
         home_assistant: Option<Part<HomeAssistant>>,
-        /// The HTTP interface, which only tells.
-        http: Option<Part<Http>>,
+        /// The HTTP interface, which only tells; `null` turns it off.
+        http: Option<Part<Http>> = Some(Part::of(Http::usual())),
         /// The folder in which the gateway remembers things between runs.
         state_dir: Part<At<String>> = Part::of(At::nowhere("/var/lib/busker".into())),
         /// An unchanged value is told again after this time.
@@ -118,12 +118,25 @@ record! {
     /// The HTTP interface, which only tells.
     pub struct Http {
         /// `host:port`; port 0 takes a free one, `null` turns HTTP off.
-        listen: Option<Listen> = Some(Listen(HostPort { host: "127.0.0.1".into(), port: 8485 })),
+        listen: Option<Listen> = Http::usual().listen,
         /// What a reader must send as bearer token to see anything but `/health`. Better kept in a file of
         /// its own, see `token_file`.
         token: Option<At<Token>>,
         /// A file whose first line is the token. A relative path is meant from where this file lies.
         token_file: Option<At<String>>,
+    }
+}
+
+impl Http {
+    /// As it is when nothing is said of it.
+    fn usual() -> Http {
+        let listen = Listen(HostPort { host: "127.0.0.1".into(), port: 8485 });
+        Http { place: Place::nowhere(), listen: Some(listen), token: None, token_file: None }
+    }
+
+    /// As it is under `http: null`.
+    pub fn off() -> Http {
+        Http { listen: None, ..Http::usual() }
     }
 }
 

@@ -135,7 +135,10 @@ impl Resolver<'_> {
         let mqtt = section(&file.mqtt).map(|mqtt| self.mqtt(&mqtt));
         let eeprom = section(&file.eeprom).map(|eeprom| self.eeprom(&eeprom));
         let recorder = section(&file.recorder).map(|recorder| self.recorder(&recorder));
-        let http = section(&file.http).map(|http| self.http(&http));
+        let http = match &file.http {
+            Some(part) => part.get().map(|http| self.http(http)),
+            None => Some(self.http(&file::Http::off())),
+        };
         let buses = self.buses(file);
         let devices = self.devices(file);
         // Each `?` stands for a fault that has been noted.

@@ -179,6 +179,7 @@ fn what_is_left_out_has_the_documented_default() {
     assert!(settings.http.token == Password::None);
     let http = good("buses: {}\nhttp: {listen: null, token_file: /t}\n").0.http;
     assert!(http.listen.is_none() && http.token == Password::File("/t".into()));
+    assert_eq!(good("buses: {}\nhttp: null\n").0.http.listen, None);
 }
 
 #[test]

@@ -65,6 +65,7 @@ impl GatewayReport {
                 "connects": self.broker.connects,
                 "client_id_taken": self.broker.client_id_taken,
                 "state_denied": self.broker.state_denied,
+                "kept_back": self.broker.kept_back,
                 "waiting": self.broker.waiting,
                 "dropped": self.broker.dropped,
             },

@@ -6,7 +6,9 @@ use serde_json::{Value, json};
 
 use super::{Announcement, Gateway, Outline, announce_bridge, announce_bus, announcement, farewell};
 use crate::engine::address::{Address, Span, Table};
+use crate::engine::configuration;
 use crate::engine::device::{Case, Encoding, Form, Kind, Names, Point, Poll, Unit, Write, WriteRule};
+use crate::engine::profile::Library;
 use crate::engine::settings::DeviceSettings;
 use crate::engine::test_device::device_of;
 use crate::engine::time::Duration;
@@ -108,6 +110,41 @@ fn an_announcement_is_one_retained_message_with_everything_home_assistant_needs(
     let components = told["components"].as_object_mut().expect("an object");
     components.retain(|key, _| !key.starts_with("wire_"));
     assert_eq!(told, expected);
+}
+
+#[test]
+fn a_thermostat_is_turned_in_the_steps_of_its_wanted_temperature() {
+    for (target, step) in [
+        ("type: i16, decimals: 1, write: 5..30 step 0.5", 0.5),
+        ("type: i16, decimals: 1, write: 5..30", 0.1),
+        ("type: i16, decimals: 2, write: 5..30", 0.1),
+        ("write: 5..30", 1.0),
+        ("type: f32, write: 5..30", 0.1),
+    ] {
+        let text = format!(
+            "buses: {{plant: {{tcp: 'host:502'}}}}
+devices:
+  room:
+    bus: plant
+    unit: 1
+    points:
+      now: {{at: input 0, unit: °C, poll: fast}}
+      target: {{at: holding 0, unit: °C, poll: fast, {target}}}
+      heat: {{at: coil 0, poll: fast, write: any}}
+    things:
+      room:
+        as: climate
+        temperature: now
+        target: target
+        state: {{'off': {{heat: OFF}}, heat: {{heat: ON}}}}
+        do: {{'off': [{{heat: OFF}}], heat: [{{heat: ON}}]}}
+"
+        );
+        let loaded = configuration::load("busker.yaml", text.as_bytes(), &Library::shipped());
+        let settings = loaded.unwrap_or_else(|faults| panic!("{faults:?}")).0;
+        let told = payload(&announcement(&gateway(), &settings.devices[0], "plant", &[None; 3]).message());
+        assert_eq!(told["components"]["room"]["temp_step"], json!(step), "{target}");
+    }
 }
 
 #[test]

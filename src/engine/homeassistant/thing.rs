@@ -128,6 +128,9 @@ pub(super) fn thing_component(
     Some(component)
 }
 
+/// No thermostat is turned by less.
+const TENTH: Decimal = Decimal { units: 1, decimals: 1 };
+
 /// Whether Home Assistant is told of the thing now: it lives, and what a climate shows is a temperature.
 fn is_there(device: &Device, thing: &Thing, known: &[Option<i128>]) -> bool {
     let is_possible = thing.kind != ThingKind::Climate || temperature_unit(device, thing, known).is_some();
@@ -156,6 +159,7 @@ fn climate_parts(
     let target_form = codec::resolve(&device.device, target, known).ok()?;
     let rule = points[target].write.as_ref().map(|write| &write.rule);
     let limits = rule.and_then(|rule| codec::limits(&target_form, rule));
+    let step = limits.and_then(|limits| limits.step).filter(|step| step.compare(TENTH).is_gt());
     let number = |decimal: Decimal| json!(decimal.to_f64());
     let topic = |point: PointIndex| Value::from(own.state(&points[point].name));
     Some(vec![
@@ -166,6 +170,6 @@ fn climate_parts(
         // Home Assistant's own limits are those of a living room.
         ("min_temp", limits.map_or(json!(-50), |limits| number(limits.min))),
         ("max_temp", limits.map_or(json!(150), |limits| number(limits.max))),
-        ("temp_step", json!(0.1)),
+        ("temp_step", number(step.unwrap_or(TENTH))),
     ])
 }

@@ -21,7 +21,7 @@ impl Scalar for String {
     const EXPECTED: &'static str = "a text";
 
     fn parse(text: &str) -> Result<String, String> {
-        if text.is_empty() {
+        if text.trim().is_empty() {
             Err("an empty text; expected at least a letter".into())
         } else {
             Ok(text.into())

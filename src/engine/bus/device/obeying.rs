@@ -1,7 +1,7 @@
 //! What a device does with commands: which it can take, what is asked for them, and what follows.
 
 use crate::engine::codec;
-use crate::engine::command::{Outcome, OutcomeKind};
+use crate::engine::command::{CommandFlow, Outcome, OutcomeKind, Step};
 use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::plan::Read;
@@ -164,6 +164,23 @@ impl DeviceState {
             warned_of.push(target);
         }
         first
+    }
+
+    /// Why the wish breaks a rule, whatever the device says until it would have its turn: nothing that could change
+    /// meanwhile decides what the point means.
+    pub(in crate::engine::bus) fn refusal_of(
+        &self,
+        target: Target,
+        wanted: &str,
+    ) -> Option<(PointIndex, Outcome)> {
+        let Target::Point(point) = target else { return None };
+        if !self.is_present() || !self.details(point).selectors().is_empty() {
+            return None;
+        }
+        match CommandFlow::begin(self.device(), point, wanted, self.known()) {
+            (None, Step::Finished(outcome)) => Some((point, outcome)),
+            _ => None,
+        }
     }
 
     /// The connection is new: the broker tells again which retained commands it holds.

@@ -108,7 +108,8 @@ impl DeviceState {
         }
         self.publish_availability(true, context);
         let drift_changed = self.keep_settings(now, context);
-        let is_news = self.values.take_missing_changed() || !self.told.present || drift_changed;
+        let missing_changed = self.values.take_missing_changed() | self.told.take_missing_changed();
+        let is_news = missing_changed || !self.told.present || drift_changed;
         if is_news || self.info_is_old(now, context) {
             self.tell_info(now, context);
         }

@@ -108,21 +108,25 @@ impl DeviceState {
             };
         }
         let reading = self.values.reading(index);
-        let missing = match reading {
-            Reading::Missing(Missing::NotYetRead) if point.is_read_on_request() => {
-                Some(("on_request", "read only when somebody asks for it".into()))
-            }
-            Reading::Missing(missing) => Some((missing.name(), missing.to_string())),
-            _ => None,
-        };
         PointReport {
             value: reading.to_string(),
             is_list: matches!(reading, Reading::List(_)),
             unit: self.unit_of(index),
-            missing,
+            missing: self.why_missing(index),
             read_at: self.values.read_at(index),
             good_for: self.period_of(point.poll).map(good_for),
             ..told
+        }
+    }
+
+    /// Why the point has no value, as a word for programs and as a sentence.
+    pub(super) fn why_missing(&self, index: PointIndex) -> Option<(&'static str, String)> {
+        match self.values.reading(index) {
+            Reading::Missing(Missing::NotYetRead) if self.details(index).is_read_on_request() => {
+                Some(("on_request", "read only when somebody asks for it".into()))
+            }
+            Reading::Missing(missing) => Some((missing.name(), missing.to_string())),
+            _ => None,
         }
     }
 
@@ -136,15 +140,13 @@ impl DeviceState {
     }
 
     fn report_thing(&self, thing: &Thing) -> ThingReport {
-        let state = self.state_of(thing).map(str::to_string);
-        let why = |missing: Missing| Some((missing.name(), missing.to_string()));
-        let missing = match codec::lives(self.device(), &thing.when, self.known()) {
-            _ if state.is_some() => None,
-            _ if self.presence != Presence::Present => why(Missing::Offline),
-            Ok(false) => why(Missing::NotInThisMode),
-            Err(missing) => why(missing),
-            Ok(true) => Some(("no_state", "what its points say is none of its states".into())),
-        };
+        let state = self.state_of(thing);
+        let missing = state.as_ref().err().map(|missing| match missing {
+            _ if self.presence != Presence::Present => Missing::Offline,
+            missing => missing.clone(),
+        });
+        let missing = missing.map(|missing| (missing.name(), missing.to_string()));
+        let state = state.ok().map(str::to_string);
         let name_of = |point: PointIndex| self.details(point).name.clone();
         let mut made_of: Vec<String> =
             thing.states.iter().flat_map(|state| &state.row).map(|(point, _)| name_of(*point)).collect();

@@ -28,11 +28,21 @@ pub(super) struct Told {
     pub(super) announcement_due: bool,
     /// A `get` or a command wants these told even if they have not changed.
     wanted: Vec<PointIndex>,
-    /// What each thing was last told to be, and when.
-    things: Vec<Option<(String, Time)>>,
+    /// What each thing was last told to be.
+    things: Vec<Option<ToldThing>>,
+    /// Why a thing has no state has changed since the last info.
+    missing_changed: bool,
     /// When the points that tell events last did.
     happened: BTreeMap<PointIndex, Time>,
     pub(super) whole: Whole,
+}
+
+#[derive(Clone)]
+struct ToldThing {
+    text: String,
+    /// Why it had no state.
+    missing: Option<Missing>,
+    at: Time,
 }
 
 impl Told {
@@ -46,6 +56,7 @@ impl Told {
             announcement_due: true,
             wanted: Vec::new(),
             things: vec![None; device.things.len()],
+            missing_changed: false,
             happened: BTreeMap::new(),
             whole: Whole::default(),
         }
@@ -69,6 +80,11 @@ impl Told {
     fn take_wanted(&mut self, point: PointIndex) -> bool {
         let at = self.wanted.iter().position(|other| *other == point);
         at.map(|at| self.wanted.remove(at)).is_some()
+    }
+
+    /// Whether why a thing has no state has changed since this was last called.
+    pub(super) fn take_missing_changed(&mut self) -> bool {
+        std::mem::take(&mut self.missing_changed)
     }
 
     pub(super) fn is_available(&self) -> bool {
@@ -132,39 +148,52 @@ impl DeviceState {
         self.period_of(poll).map_or(republish, early)
     }
 
-    /// What things are follows from what their points say.
+    /// What things are follows from what their points say. They are looked at after each poll.
     pub(super) fn tell_things(&mut self, now: Time, context: &mut Context) {
+        if self.settings.device.things.is_empty() {
+            return;
+        }
+        let is_fast = self.settings.device.points.iter().any(|point| point.poll == Poll::Fast);
+        let again = self.told_again_after(if is_fast { Poll::Fast } else { Poll::Slow }, context.republish);
         for (index, thing) in self.settings.device.things.iter().enumerate() {
             if thing.states.is_empty() {
                 continue;
             }
-            let text = self.state_of(thing).unwrap_or("None");
-            let Told { things, whole, .. } = &mut self.told;
+            let state = self.state_of(thing);
+            let text = *state.as_ref().unwrap_or(&"None");
+            let missing = state.err();
+            let Told { things, whole, missing_changed, .. } = &mut self.told;
             let told = &mut things[index];
-            let is_told = |(before, at): &(String, Time)| before == text && now - *at < context.republish;
-            if !told.as_ref().is_some_and(is_told) {
-                if told.as_ref().is_some_and(|(before, _)| before == text) {
-                    whole.is_told_again(now, context.republish);
-                } else {
-                    whole.has_changed();
-                }
-                *told = Some((text.to_string(), now));
-                let topic = context.topics_of(&self.settings.name).state(&thing.name);
-                context.publish(Message::retained(topic, text));
+            let before = told.as_ref().map(|told| told.text.as_str());
+            if told.as_ref().is_none_or(|told| told.missing != missing) {
+                *missing_changed = true;
             }
+            if before == Some(text) && told.as_ref().is_some_and(|told| now - told.at < again) {
+                told.iter_mut().for_each(|told| told.missing.clone_from(&missing));
+                continue;
+            }
+            if before == Some(text) {
+                whole.is_told_again(now, context.republish);
+            } else {
+                whole.has_changed();
+            }
+            *told = Some(ToldThing { text: text.to_string(), missing, at: now });
+            let topic = context.topics_of(&self.settings.name).state(&thing.name);
+            context.publish(Message::retained(topic, text));
         }
     }
 
-    /// The first of the thing's states whose row holds; `None` if none does, or if it does not live.
-    pub(super) fn state_of<'t>(&self, thing: &'t Thing) -> Option<&'t str> {
-        if codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
-            return None;
+    /// The first of the thing's states whose row holds, or why there is none.
+    pub(super) fn state_of<'t>(&self, thing: &'t Thing) -> Result<&'t str, Missing> {
+        if !codec::lives(self.device(), &thing.when, self.known())? {
+            return Err(Missing::NotInThisMode);
         }
         let says = |(point, text): &(PointIndex, String)| match self.values.reading(*point) {
             Reading::Missing(_) => false,
             reading => reading.to_string() == *text,
         };
-        thing.states.iter().find(|state| state.row.iter().all(says)).map(|state| state.name.as_str())
+        let state = thing.states.iter().find(|state| state.row.iter().all(says));
+        state.map(|state| state.name.as_str()).ok_or(Missing::NoState)
     }
 
     /// The thing is told again even if it has not changed.
@@ -225,22 +254,7 @@ impl DeviceState {
     /// no reason to tell it: so it is as of when this was told.
     pub(super) fn tell_info(&mut self, now: Time, context: &mut Context) {
         let is_online = self.told.is_available();
-        let missing: serde_json::Map<String, serde_json::Value> = self
-            .settings
-            .device
-            .points
-            .iter()
-            .enumerate()
-            .filter(|(_, point)| !point.is_button())
-            .filter_map(|(index, point)| match self.values.reading(index) {
-                // Nobody has asked for it.
-                Reading::Missing(Missing::NotYetRead) if point.is_read_on_request() => None,
-                Reading::Missing(missing) if is_online => {
-                    Some((point.name.clone(), missing.to_string().into()))
-                }
-                _ => None,
-            })
-            .collect();
+        let missing = if is_online { self.missing_json() } else { json!({}) };
         let mut info = json!({
             "profile": self.settings.device.profile,
             "manufacturer": self.settings.device.manufacturer,
@@ -265,6 +279,21 @@ impl DeviceState {
         (self.told.info, self.told.info_at) = (without_dates, now);
         info["last_read"] = self.dates_of_readings(context);
         context.publish(Message::retained(context.topics_of(&self.settings.name).info(), info.to_string()));
+    }
+
+    /// Why there is no value on the topics on which `None` stands.
+    fn missing_json(&self) -> serde_json::Value {
+        let device = &self.settings.device;
+        let points = device.points.iter().enumerate().filter(|(_, point)| !point.is_button());
+        let of_points = points.filter_map(|(index, point)| Some((&point.name, self.why_missing(index)?.1)));
+        let things = device.things.iter().filter(|thing| !thing.states.is_empty());
+        let of_things =
+            things.filter_map(|thing| Some((&thing.name, self.state_of(thing).err()?.to_string())));
+        of_points
+            .chain(of_things)
+            .map(|(name, why)| (name.clone(), why.into()))
+            .collect::<serde_json::Map<_, _>>()
+            .into()
     }
 
     /// What the guard of the EEPROM holds back: values that wait, each until when, and until when nothing at all

@@ -68,7 +68,7 @@ impl DeviceState {
                 (&point.name, told)
             });
         let things = device.things.iter().filter(|thing| thing.kind != ThingKind::Button).map(|thing| {
-            let state = self.state_of(thing).map_or("null".into(), quoted);
+            let state = self.state_of(thing).map_or_else(|_| "null".into(), quoted);
             (&thing.name, state)
         });
         let members: Vec<String> =
