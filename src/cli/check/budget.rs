@@ -36,6 +36,7 @@ pub struct Budget {
 impl Budget {
     pub fn of(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> Budget {
         let tariff = Tariff::of(&bus.link, bus.gap);
+        let taken = tariff.taken(&bus.link, turnaround);
         // As the running program plans them once it knows the device.
         let planned_with = plan::planned_with(turnaround);
         let (mut reads, mut wants) = (Vec::new(), Vec::new());
@@ -44,9 +45,9 @@ impl Budget {
         for (device, (settings, idle_rest)) in devices.iter().zip(rests).enumerate() {
             let wire = &settings.device.wire;
             longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
-            wants.push(Wants::of(settings, tariff.cost(turnaround)));
+            wants.push(Wants::of(settings, taken));
             for read in plan(&settings.device, tariff.cost(planned_with + idle_rest), &[]) {
-                let time = tariff.cost(turnaround).time_of(read.span);
+                let time = taken.time_of(read.span);
                 let rest = wire.limits.delay;
                 let period = match read.poll {
                     Poll::Fast => Some(wire.intervals.fast.as_secs_f64()),
@@ -69,7 +70,8 @@ impl Budget {
 
     /// Seconds of wire that are wanted in a second; above 1 every period is longer by as much.
     pub fn load(&self) -> f64 {
-        let load = self.load_at(1.0);
+        // (The sum of nothing is -0.)
+        let load = self.load_at(1.0) + 0.0;
         // Where feeding alone is too much, no stretch of the polls makes room for it.
         if load <= 1.0 || self.load_of_feeding() >= 1.0 { load } else { self.stretch() }
     }
