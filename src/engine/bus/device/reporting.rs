@@ -37,6 +37,8 @@ impl DeviceState {
             model: device.model.clone(),
             unit: self.settings.unit,
             online,
+            is_missed: !online
+                && (self.patience.is_probing() || matches!(self.presence, Presence::Mismatch { .. })),
             reason: self.reason().or(begins),
             identity: self.identity.clone(),
             counters: self.counters,
