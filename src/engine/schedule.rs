@@ -84,10 +84,17 @@ impl Default for Pace {
 impl Pace {
     /// Each turn moves the average by this part of itself.
     const STEP: f64 = 1.0 / 32.0;
+    /// Less than this is what comes and goes on a bus that keeps up.
+    const BEHIND: f64 = 1.1;
 
     /// Nothing is due.
     pub fn idle(&mut self, now: Time) {
         self.idle_at = Some(now);
+    }
+
+    /// Whether periods are longer than they should be, and there was no moment within this time when nothing was due.
+    pub fn is_behind(&self, now: Time, time: Duration) -> bool {
+        self.stretch > Pace::BEHIND && self.idle_at.is_none_or(|idle_at| now - idle_at > time)
     }
 
     /// From when on a read that begins now counts its next period.

@@ -14,6 +14,7 @@ mod line;
 mod link;
 mod load;
 mod pause;
+mod probing;
 mod recording;
 mod requests;
 mod timekeeping;
