@@ -92,6 +92,11 @@ impl Pace {
         self.idle_at = Some(now);
     }
 
+    /// By how much periods are longer than they should be, on average.
+    pub fn stretch(&self) -> f64 {
+        self.stretch
+    }
+
     /// Whether periods are longer than they should be, and there was no moment within this time when nothing was due.
     pub fn is_behind(&self, now: Time, time: Duration) -> bool {
         self.stretch > Pace::BEHIND && self.idle_at.is_none_or(|idle_at| now - idle_at > time)
@@ -319,6 +324,15 @@ impl Polls {
             planned.real_period.map(|period| waits.map_or(period, |waits| period.max(waits)))
         };
         of_class.filter_map(lasting).max()
+    }
+
+    /// How much of the time the reads take that come round, if each takes so long.
+    pub fn filled(&self, taken: impl Fn(&Read) -> Duration) -> f64 {
+        let awake = self.reads.iter().filter(|planned| !planned.sleeps);
+        let share = |planned: &Planned| {
+            planned.period.map(|period| taken(&planned.read).as_secs_f64() / period.as_secs_f64().max(1e-6))
+        };
+        awake.filter_map(share).sum()
     }
 
     /// Each read with the period in which it comes round, as far as it does: as wanted, or as long as it

@@ -97,6 +97,8 @@ pub(super) struct DeviceState {
     beats: Beats,
     /// When the points that tell events last did.
     happened: BTreeMap<PointIndex, Time>,
+    /// How it keeps up with its periods, where it wants silence before each request.
+    own_pace: Pace,
     /// The configuration knows it no more, or knows it otherwise: nothing more is begun with it.
     pub(super) is_leaving: bool,
 }
@@ -177,6 +179,7 @@ impl DeviceState {
             told_things: vec![None; settings.device.things.len()],
             beats: Beats::new(&settings.device),
             happened: BTreeMap::new(),
+            own_pace: Pace::default(),
             is_leaving: false,
             settings,
         }
@@ -252,6 +255,26 @@ impl DeviceState {
         now < self.rested_at() && self.is_present() && self.polls.due_at().is_some_and(|due| due <= now)
     }
 
+    /// Whether it wants silence before each request.
+    pub(super) fn wants_rest(&self) -> bool {
+        !self.settings.device.wire.limits.delay.is_zero()
+    }
+
+    /// Whether its requests and the silence before them take so long that its periods are longer by more than those
+    /// of its bus.
+    fn is_filled_by_rest(&self, of_bus: &Pace) -> bool {
+        let cost = self.tariff.cost(self.turnaround.planned_with());
+        let rest = self.settings.device.wire.limits.delay;
+        !rest.is_zero() && self.polls.filled(|read| cost.time_of(read.span) + rest) > of_bus.stretch()
+    }
+
+    /// Nothing is due on its bus.
+    pub(super) fn is_idle(&mut self, now: Time) {
+        if !self.only_rests(now) {
+            self.own_pace.idle(now);
+        }
+    }
+
     /// How urgent its next question can be at most.
     pub(super) fn outlook(&self, now: Time) -> Outlook {
         let reads = if self.is_present() { self.polls.by_period(now) } else { None };
@@ -301,7 +324,10 @@ impl DeviceState {
 
     /// Returns what its turn was before.
     pub(super) fn begin_read(&mut self, read: usize, now: Time, pace: &mut Pace) -> Turn {
-        Turn { place: Some(self.polls.begin(read, now, pace)), ..self.turn() }
+        // What keeps it behind is its own rest, which says nothing of the line's other devices.
+        let pace = if self.is_filled_by_rest(pace) { &mut self.own_pace } else { pace };
+        let place = self.polls.begin(read, now, pace);
+        Turn { place: Some(place), ..self.turn() }
     }
 
     pub(super) fn turn(&self) -> Turn {
