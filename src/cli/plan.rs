@@ -84,7 +84,7 @@ fn of_profile(id: &str, turnaround: Duration) -> Result<DevicePlan, Failure> {
     let link = Link::Serial { path: String::new(), line, rs485: Rs485::Auto };
     let tariff = Tariff::of(&link, None);
     if id.ends_with(".yaml") {
-        return Ok(plan_of(id, &load_file(Path::new(id))?, tariff, turnaround, Duration::ZERO));
+        return Ok(plan_of(id, &load_file(Path::new(id))?, &link, tariff, turnaround, Duration::ZERO));
     }
     let library = Library::shipped();
     if !library.contains(id) {
@@ -94,7 +94,7 @@ fn of_profile(id: &str, turnaround: Duration) -> Result<DevicePlan, Failure> {
         )));
     }
     let device = library.load(id).map_err(configuration::faults)?;
-    Ok(plan_of(id, &device, tariff, turnaround, Duration::ZERO))
+    Ok(plan_of(id, &device, &link, tariff, turnaround, Duration::ZERO))
 }
 
 fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
@@ -119,7 +119,7 @@ fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
             let rests = tariff.idle_rests(&on_bus.iter().map(|other| &*other.device).collect::<Vec<_>>());
             let of_device = on_bus.iter().zip(rests).find(|(other, _)| other.name == device.name);
             let idle_rest = of_device.map_or(Duration::ZERO, |(_, rest)| rest);
-            plan_of(&device.name, &device.device, tariff, args.turnaround, idle_rest)
+            plan_of(&device.name, &device.device, &bus.link, tariff, args.turnaround, idle_rest)
         })
         .collect())
 }
@@ -128,12 +128,13 @@ fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
 fn plan_of(
     name: &str,
     device: &Device,
+    link: &Link,
     tariff: Tariff,
     turnaround: Duration,
     idle_rest: Duration,
 ) -> DevicePlan {
     let reads = plan::plan(device, tariff.cost(plan::planned_with(turnaround) + idle_rest), &[]);
-    let cost = tariff.cost(turnaround);
+    let taken = tariff.taken(link, turnaround);
     let row = |read: &Read| ReadRow {
         poll: read.poll.name(),
         table: read.span.table().name(),
@@ -141,7 +142,7 @@ fn plan_of(
         last: read.span.last(),
         points: read.points.iter().map(|(point, _)| device.points[*point].name.clone()).collect(),
         sleeps_by: read.sleeps_by(device).iter().map(|point| device.points[*point].name.clone()).collect(),
-        wire_ms: cost.of_read(read.span) as f64 / 1e6,
+        wire_ms: taken.of_read(read.span) as f64 / 1e6,
     };
     DevicePlan {
         device: name.to_string(),

@@ -145,6 +145,9 @@ pub struct DeviceReport {
     pub model: String,
     pub unit: u8,
     pub online: bool,
+    /// It is offline since it has been asked and is not there. A device that has only just been asked, or is being
+    /// read for the first time, may be.
+    pub is_missed: bool,
     /// Why it is offline, or what is wrong with it although it answers.
     pub reason: Option<String>,
     /// What the device said of itself: `METZ CONNECT GmbH MR-DO4 V1.4`.
@@ -346,11 +349,12 @@ pub struct BusHealth {
 }
 
 impl BusHealth {
-    /// Nothing on this bus can be reached. One dead device is no lost bus, even if it is the only one.
+    /// Nothing on this bus can be reached. One dead device is no lost bus, even if it is the only one; nor is a bus
+    /// whose devices have still to be read, as at the end of a pause.
     fn is_lost(&self) -> bool {
         let devices = &self.report.devices;
         !self.report.paused
-            && (!self.report.up || (devices.len() > 1 && devices.iter().all(|device| !device.online)))
+            && (!self.report.up || (devices.len() > 1 && devices.iter().all(|device| device.is_missed)))
     }
 }
 
@@ -409,6 +413,7 @@ mod tests {
             profile: "test".into(),
             unit: 1,
             online,
+            is_missed: !online,
             reason: (!online).then(|| "no answer in time".into()),
             counters: Counters { timeouts: 3, ..Counters::default() },
             last_answer_at: Some(Time::from_millis(1000)),
@@ -467,6 +472,9 @@ mod tests {
             assert_eq!(report.status(), expected, "{report:?}");
             assert_eq!(report.to_json()["status"], expected.name());
         }
+        let mut report = gateway(true, true, true, &[false, false]);
+        report.buses[0].report.devices[1].is_missed = false;
+        assert_eq!(report.status(), Status::Degraded, "one of them is being read");
     }
 
     #[test]

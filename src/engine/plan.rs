@@ -17,7 +17,8 @@ use crate::engine::time::Duration;
 pub struct Read {
     pub poll: Poll,
     pub span: Span,
-    /// The points in it, by address, each with the place from which this read takes it.
+    /// The points in it, by address, each with the place from which this read takes it. None where it only asks whether
+    /// the device is there.
     pub points: Vec<(PointIndex, Address)>,
     /// Reading it changes the device, so nothing else travels with it.
     pub alone: bool,
@@ -103,6 +104,15 @@ impl Tariff {
         Cost { request: self.request + turnaround.as_nanos() as u64, byte: self.byte }
     }
 
+    /// What a request to such a device takes. On Modbus TCP that is the round trip, whatever it brings: what else
+    /// a request is charged there when reads are cut is the work that it makes on both sides.
+    pub fn taken(self, link: &Link, turnaround: Duration) -> Cost {
+        match link.line() {
+            Some(_) => self.cost(turnaround),
+            None => Cost { request: turnaround.as_nanos() as u64, byte: 0 },
+        }
+    }
+
     /// Of the silence that each of these devices wants before it is asked again (`delay`), the part that nobody
     /// else on their bus makes use of: it is lost with each request, as if the device took that much longer to
     /// answer. A device that has the line for itself loses all of it, one among others that keep the line
@@ -182,45 +192,88 @@ pub const USUAL_TURNAROUND: Duration = Duration::from_millis(5);
 /// The cheapest safe reads of `device`, by poll class, table and address. `refused` are spans that
 /// the device has refused to give in one answer ([`Read::refused`]): no read of several points
 /// contains one.
+///
+/// A device that is only ever written to has one read for no point: whatever it answers, it is there.
 pub fn plan(device: &Device, cost: Cost, refused: &[Span]) -> Vec<Read> {
+    let reads = of_what_is_polled(device, cost, refused);
+    if reads.is_empty() { sign_of_life(device).into_iter().collect() } else { reads }
+}
+
+fn sign_of_life(device: &Device) -> Option<Read> {
+    let harmless = device.points.iter().filter(|point| !point.read_clears);
+    let readable = &device.wire.readable;
+    // Outside of what it gives it may say nothing at all.
+    let is_given = |span: Span| readable.is_empty() || readable.iter().any(|range| range.contains(span));
+    let shortest = harmless.map(|point| point.at.span).min_by_key(|span| (!is_given(*span), span.count()));
+    shortest.map(|span| Read { poll: Poll::Slow, span, points: Vec::new(), alone: false })
+}
+
+fn of_what_is_polled(device: &Device, cost: Cost, refused: &[Span]) -> Vec<Read> {
     let mut places: Vec<Address> = device.points.iter().map(|point| point.at).collect();
     let mut best = plan_at(device, &places, cost, refused);
-    // The same value may stand in two places (relay states as coils and as bits of a register). Most often
-    // all points that have the same two tables are best moved together; then each that lies apart from the
-    // others by itself.
-    let mut together = groups_with_a_second_place(device);
-    let each: Vec<Vec<PointIndex>> = together.iter().flatten().map(|point| vec![*point]).collect();
-    together.extend(each);
-    for moved in together {
-        let mut elsewhere = places.clone();
-        for index in moved {
-            let point = &device.points[index];
-            let Some(also) = point.also else { continue };
-            elsewhere[index] = if places[index] == also { point.at } else { also };
+    // The same value may stand in two places (relay states as coils and as bits of a register), and the places of
+    // one decide which are best for others: so all that have the same two tables are moved, what lies side by side in
+    // both, and each by itself, until nothing of it makes the reads cheaper.
+    let moves = moves_to_second_places(device);
+    loop {
+        let before = total(&best, cost);
+        for moved in &moves {
+            let mut elsewhere = places.clone();
+            for index in moved {
+                let point = &device.points[*index];
+                let Some(also) = point.also else { continue };
+                elsewhere[*index] = if places[*index] == also { point.at } else { also };
+            }
+            let candidate = plan_at(device, &elsewhere, cost, refused);
+            if total(&candidate, cost) < total(&best, cost) {
+                (best, places) = (candidate, elsewhere);
+            }
         }
-        let candidate = plan_at(device, &elsewhere, cost, refused);
-        if total(&candidate, cost) < total(&best, cost) {
-            (best, places) = (candidate, elsewhere);
+        if total(&best, cost) == before {
+            return best;
         }
     }
-    best
 }
 
 fn total(reads: &[Read], cost: Cost) -> u64 {
     reads.iter().map(|read| cost.of_read(read.span)).sum()
 }
 
-fn groups_with_a_second_place(device: &Device) -> Vec<Vec<PointIndex>> {
+/// Sets of points with a second place that are worth moving there together.
+fn moves_to_second_places(device: &Device) -> Vec<Vec<PointIndex>> {
+    let seconds =
+        || device.points.iter().enumerate().filter_map(|(index, point)| Some((index, point, point.also?)));
     let mut groups: Vec<(_, Vec<PointIndex>)> = Vec::new();
-    for (index, point) in device.points.iter().enumerate() {
-        let Some(also) = point.also else { continue };
+    let mut runs: Vec<Vec<PointIndex>> = Vec::new();
+    for (index, point, also) in seconds() {
         let key = (point.poll, point.at.span.table(), also.span.table());
         match groups.iter_mut().find(|(other, _)| *other == key) {
             Some((_, members)) => members.push(index),
             None => groups.push((key, vec![index])),
         }
+        let is_beside = |last: &PointIndex| {
+            let before = &device.points[*last];
+            before.poll == point.poll
+                && adjoin(before.at.span, point.at.span)
+                && before.also.is_some_and(|before| adjoin(before.span, also.span))
+        };
+        match runs.last_mut() {
+            Some(run) if run.last().is_some_and(is_beside) => run.push(index),
+            _ => runs.push(vec![index]),
+        }
     }
-    groups.into_iter().map(|(_, members)| members).collect()
+    let mut moves: Vec<Vec<PointIndex>> = groups.into_iter().map(|(_, members)| members).collect();
+    moves.extend(runs);
+    moves.extend(seconds().map(|(index, ..)| vec![index]));
+    moves.sort_by_key(|moved| std::cmp::Reverse(moved.len()));
+    moves.dedup();
+    moves
+}
+
+/// Whether one of them begins where the other ends, or in it.
+fn adjoin(one: Span, other: Span) -> bool {
+    let (first, second) = if one.first() <= other.first() { (one, other) } else { (other, one) };
+    one.table() == other.table() && u32::from(second.first()) <= u32::from(first.last()) + 1
 }
 
 fn plan_at(device: &Device, places: &[Address], cost: Cost, refused: &[Span]) -> Vec<Read> {
@@ -365,6 +418,7 @@ impl fmt::Display for Table<'_> {
             write!(f, "{range:>13} {:>4} {unit}  ", read.span.count())?;
             let name = |index: usize| self.device.points[read.points[index].0].name.as_str();
             match read.points.len() {
+                0 => write!(f, "whether it is there")?,
                 1 => write!(f, "{}", name(0))?,
                 count => write!(f, "{} .. {} ({count})", name(0), name(count - 1))?,
             }

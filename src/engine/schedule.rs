@@ -80,10 +80,22 @@ impl Default for Pace {
 impl Pace {
     /// Each turn moves the average by this part of itself.
     const STEP: f64 = 1.0 / 32.0;
+    /// Less than this is what comes and goes on a bus that keeps up.
+    const BEHIND: f64 = 1.1;
 
     /// Nothing is due.
     pub fn idle(&mut self, now: Time) {
         self.idle_at = Some(now);
+    }
+
+    /// By how much periods are longer than they should be, on average.
+    pub fn stretch(&self) -> f64 {
+        self.stretch
+    }
+
+    /// Whether periods are longer than they should be, and there was no moment within this time when nothing was due.
+    pub fn is_behind(&self, now: Time, time: Duration) -> bool {
+        self.stretch > Pace::BEHIND && self.idle_at.is_none_or(|idle_at| now - idle_at > time)
     }
 
     /// From when on a read that begins now counts its next period.
@@ -306,6 +318,15 @@ impl Polls {
             planned.real_period.map(|period| waits.map_or(period, |waits| period.max(waits)))
         };
         of_class.filter_map(lasting).max()
+    }
+
+    /// How much of the time the reads take that come round, if each takes so long.
+    pub fn filled(&self, taken: impl Fn(&Read) -> Duration) -> f64 {
+        let awake = self.reads.iter().filter(|planned| !planned.sleeps);
+        let share = |planned: &Planned| {
+            planned.period.map(|period| taken(&planned.read).as_secs_f64() / period.as_secs_f64().max(1e-6))
+        };
+        awake.filter_map(share).sum()
     }
 
     /// Each read with the period in which it comes round, as far as it does: as wanted, or as long as it

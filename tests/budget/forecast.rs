@@ -81,6 +81,11 @@ fn cases() -> Vec<Case> {
             })
             .collect()
     };
+    let with_one_resting = |fast: &str, slow: &str| {
+        let mut devices = mixed(fast, slow);
+        devices[0].0 += DELAY;
+        devices
+    };
     vec![
         Case { what: "W1", bus: W1, turnaround: "5ms", devices: ten("fast: 1ms", twenty(true, "fast")) },
         Case { what: "W2", bus: W1, turnaround: "5ms", devices: ten("fast: 1ms", twenty(false, "fast")) },
@@ -128,6 +133,18 @@ fn cases() -> Vec<Case> {
             bus: W1,
             turnaround: "5ms",
             devices: mixed("170ms", "3s"),
+        },
+        Case {
+            what: "one unit of six wants more silence than its periods leave it",
+            bus: W1,
+            turnaround: "5ms",
+            devices: with_one_resting("250ms", "5s"),
+        },
+        Case {
+            what: "one of six wants silence, and all are too slow",
+            bus: W1,
+            turnaround: "5ms",
+            devices: with_one_resting("70ms", "1s"),
         },
         Case { what: "two classes, too slow", bus: W1, turnaround: "5ms", devices: mixed("100ms", "1s") },
         Case {
@@ -191,9 +208,12 @@ fn an_overloaded_bus_stretches_every_period_of_every_unit_by_the_same_factor() {
     for case in cases().iter().filter(|case| case.what.ends_with("too slow")) {
         let mut wire = case.wire();
         wire.run_until(RUN);
+        // How long a unit waits that wants silence, it decides itself.
+        let rests = |unit: u8| case.devices[usize::from(unit) - 1].0.ends_with(DELAY);
         let stretches: Vec<f64> = wire
             .periods()
             .into_iter()
+            .filter(|((unit, _), _)| !rests(*unit))
             .map(|((unit, address), found)| {
                 let poll = &case.devices[usize::from(unit) - 1].0;
                 let (fast, slow) = poll.split_once(", ").expect("two classes");
@@ -209,7 +229,7 @@ fn an_overloaded_bus_stretches_every_period_of_every_unit_by_the_same_factor() {
         let (least, most) = stretches
             .iter()
             .fold((f64::MAX, 0.0_f64), |(least, most), one| (least.min(*one), most.max(*one)));
-        assert!(stretches.len() == 12 && least > 1.3, "{}: {stretches:?}", case.what);
+        assert!(stretches.len() >= 10 && least > 1.3, "{}: {stretches:?}", case.what);
         assert!(most / least < 1.05, "{}: {stretches:?}", case.what);
     }
 }

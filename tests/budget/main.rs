@@ -3,6 +3,7 @@
 
 mod feeding;
 mod forecast;
+mod network;
 mod plans;
 mod wire;
 

@@ -97,6 +97,63 @@ fn on_a_calm_line_the_late_answer_of_a_unit_that_returns_slower_is_heard_and_it_
     assert!(last.at >= returned_at && last.message.payload == "online", "{:?}", last.message);
 }
 
+#[test]
+fn many_dead_units_together_cost_a_quarter_more_at_most() {
+    for (alive, units, dead) in [(5, 20, 10), (5, 30, 25), (0, 20, 10), (0, 30, 25)] {
+        let live = units - dead;
+        let mut world = world(units);
+        let power = |world: &mut World, on: bool| {
+            (live + 1..=units).for_each(|unit| world.act(unit, &Action::Power { unit, on }));
+        };
+        power(&mut world, alive > 0);
+        world.run_until(world.now + Duration::from_secs(alive));
+        power(&mut world, false);
+        // Where so many are dead, it takes long until they are known to be.
+        world.run_until(world.now + Duration::from_secs(120));
+        let time = Duration::from_secs(120);
+        let cost = cycle(&mut world, live, time) / cycle(&mut self::world(live), live, time) - 1.0;
+        let what = format!("{dead} of {units}, alive for {alive} s");
+        assert!(cost > 0.15 && cost <= 0.26, "{what}: {:.1} %", cost * 100.0);
+        power(&mut world, true);
+        let returned_at = world.now;
+        world.run_until(returned_at + Duration::from_secs(60));
+        let all = (1..=units).map(|unit| is_online(&world, unit)).collect::<Vec<_>>();
+        assert!(all.iter().all(|online| *online), "{what}: {all:?}");
+    }
+}
+
+#[test]
+fn where_there_is_time_to_spare_each_of_many_dead_units_is_asked_as_often_as_one() {
+    let (units, live) = (20, 5);
+    let mut world = world_polled(units, "5s");
+    (live + 1..=units).for_each(|unit| world.act(unit, &Action::Power { unit, on: false }));
+    world.run_until(world.now + Duration::from_secs(240));
+    let from = world.now;
+    world.run_until(from + Duration::from_secs(60));
+    for unit in 1..=units {
+        let requests = world.requests();
+        let asked = requests.iter().filter(|(at, of)| *of == unit && *at >= from).map(|(at, _)| *at);
+        let times: Vec<Time> = std::iter::once(from).chain(asked).chain([world.now]).collect();
+        let longest = times.windows(2).map(|pair| pair[1] - pair[0]).max().expect("a minute");
+        assert!(longest <= Duration::from_secs(17), "unit {unit}: {longest:?}");
+    }
+}
+
+/// The mean cycle of the first units in seconds.
+fn cycle(world: &mut World, units: u8, time: Duration) -> f64 {
+    let from = world.now;
+    world.run_until(from + time);
+    let requests = world.requests();
+    let count = requests.iter().filter(|(at, unit)| *unit <= units && *at >= from).count();
+    time.as_secs_f64() / count as f64 * f64::from(units)
+}
+
+fn is_online(world: &World, unit: u8) -> bool {
+    let topic = format!("busker/unit_{unit}/availability");
+    let last = world.published.iter().rev().find(|published| published.message.topic == topic);
+    last.expect("it was told").message.payload == "online"
+}
+
 /// The unit has been alive for so long, and its return is to be noticed within so long.
 #[track_caller]
 fn check(alive: Duration, noticed_within: Duration) {

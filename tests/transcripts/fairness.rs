@@ -2,6 +2,7 @@
 //! watchdog needs comes in time.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Action, Bus, Command, Event};
@@ -113,6 +114,81 @@ fn a_poll_that_waits_for_the_line_makes_way_for_a_heartbeat() {
     bus.handle(now, Event::Withdrawn);
     let request = sent(&mut bus).expect("the heartbeat at once");
     assert_eq!((request.unit, request.call.to_string()), (1, "read holding 1".into()));
+}
+
+/// Everything that may want the line wants it at the same moment.
+#[test]
+fn when_everything_wants_the_line_it_is_given_out_in_the_stated_order() {
+    let settings = devices::settings(
+        "device damper 1 damper.yaml\ndevice heating 2 thermometer\ndevice board 3 clamping\n\
+         device meter 5 selectable\ndevice fuse 20 relays\ndevice relays 21 relays\n\
+         setting meter mode voltage enforced\n",
+    );
+    let mut bus = Bus::new(Time::default(), &settings, 0, &Memories::default());
+    let mut registers = BTreeMap::from([0, 1, 2, 3].map(|at| ((1, at), 1)));
+    // What the damper and the relays allow: 4.5 s, 2 s of which most is over then, and 4.5 s.
+    registers.extend([((1, 4), 45), ((20, 66), 200), ((21, 66), 450)]);
+    let mut now = Time::default();
+    let mut asked = Vec::new();
+    bus.handle(now, Event::LinkUp);
+    let mut is_crowded = false;
+    while asked.len() < 13 {
+        let Some(request) = sent(&mut bus) else {
+            now = bus.wake_at().expect("polls without end").max(now);
+            bus.handle(now, Event::Wake);
+            continue;
+        };
+        let sent_at = now;
+        now += TRANSACTION;
+        if is_crowded {
+            asked.push(format!("{} {}", request.unit, request.call));
+        }
+        let reads_mode = request.unit == 5 && request.call.to_string() == "read holding 16";
+        if !is_crowded && now > Time::from_millis(80_000) && reads_mode {
+            is_crowded = true;
+            // Somebody has turned the setting back, as this answer tells; it takes long to come.
+            registers.insert((5, 16), 0);
+            now += Duration::from_millis(1_600);
+            let (device, point, payload) = ("board".into(), "level".into(), "10".into());
+            bus.handle(now, Event::Command(Command { device, point, payload, retained: false }));
+            let span = Span::new(Table::Input, 40, 40).expect("a register");
+            let wish = Wish::Read { device: "heating".into(), span, clears: false };
+            let transaction = Transaction::default();
+            bus.handle(now, Event::Request(request::Request { verb: Verb::Read, transaction, wish }));
+            let wish = Wish::Scan(request::Scan {
+                first: 40,
+                last: 40,
+                known: Arc::default(),
+                ticket: Arc::default(),
+            });
+            let transaction = Transaction::default();
+            bus.handle(now, Event::Request(request::Request { verb: Verb::Scan, transaction, wish }));
+        }
+        let answer = answer(&mut registers, &request);
+        let reply = Reply::new(Ok(answer), sent_at, Some((now, now)), &mut Discarded::default());
+        bus.handle(now, Event::Reply(reply));
+    }
+    assert_eq!(
+        asked,
+        [
+            // A watchdog that is late, a command, a heartbeat and a watchdog that are due;
+            "20 read holding 66",
+            "3 write holding 2 000A",
+            "1 read holding 1",
+            "1 write holding 1 0001",
+            "21 read holding 1",
+            // a program's request, a setting with all that belongs to it, a scan;
+            "2 read input 40",
+            "5 read holding 16",
+            "5 write holding 16 0001",
+            "5 read holding 16",
+            "40 identification 1 0",
+            // the poll that is the command's read-back, and whatever else is due.
+            "3 read holding 1..2",
+            "2 read input 0",
+            "5 read input 0",
+        ]
+    );
 }
 
 /// What the bus asks next.

@@ -30,7 +30,8 @@ use feeding::{Delays, Feeding};
 pub struct Args {
     #[command(flatten)]
     configuration: ConfigurationArgs,
-    /// What devices need to begin their answer; see `turnaround` on the status page or in the metrics
+    /// What devices need to begin their answer, on Modbus TCP the whole round trip; see `turnaround` on the status
+    /// page or in the metrics
     #[arg(long, value_name = "TIME", default_value = "5ms", value_parser = <Duration as Scalar>::parse)]
     turnaround: Duration,
     /// Tell it as JSON
@@ -87,7 +88,7 @@ fn checked(args: &Args) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
 struct Summary {
     file: String,
     status: &'static str,
-    /// What devices are taken to need to begin their answer, in seconds.
+    /// What devices are taken to need to begin their answer, on Modbus TCP the whole round trip; in seconds.
     turnaround: f64,
     warnings: Vec<Finding>,
     buses: Vec<BusSummary>,
@@ -176,7 +177,7 @@ impl Summary {
             text.push_str(&format!("\nbus {}: {}{line}\n", bus.name, bus.link));
             let busy = match bus.load > 1.0 {
                 true => "busy all the time".to_string(),
-                false => format!("busy {:.0} % of the time", (bus.load * 100.0).max(0.0)),
+                false => format!("busy {} % of the time", digits(bus.load * 100.0)),
             };
             text.push_str(&format!(
                 "  {busy}; a command waits at most {}, {} while a device is silent\n",
@@ -185,9 +186,9 @@ impl Summary {
             ));
             if bus.load > 1.0 {
                 let advice = bus.advice.join("; or ");
-                let slower = (bus.load * 10.0).ceil() / 10.0;
+                let slower = digits(bus.load);
                 text.push_str(&format!(
-                    "  too slow: every period is {slower:.1} times as long as wanted; {advice}\n"
+                    "  too slow: every period is {slower} times as long as wanted; {advice}\n"
                 ));
             }
             let mut table = Table::new();
@@ -267,11 +268,47 @@ impl BusSummary {
     }
 }
 
-/// Seconds for people: `37 ms`, `1.5 s`, `10 min`.
+/// Seconds for people: `37.4 ms`, `1.52 s`, `10 min`.
 fn told(seconds: f64) -> String {
     match seconds {
-        seconds if seconds < 1.0 => format!("{:.0} ms", seconds * 1000.0),
-        seconds if seconds < 120.0 => format!("{} s", (seconds * 10.0).round() / 10.0),
-        seconds => format!("{} min", (seconds / 6.0).round() / 10.0),
+        seconds if seconds < 1.0 => format!("{} ms", digits(seconds * 1000.0)),
+        seconds if seconds < 120.0 => format!("{} s", digits(seconds)),
+        seconds => format!("{} min", digits(seconds / 60.0)),
+    }
+}
+
+/// Three digits: who compares a forecast with what is measured wants no more, and rounding must not make it wrong.
+fn digits(number: f64) -> String {
+    let decimals = match number {
+        number if number >= 99.95 => return format!("{number:.0}"),
+        number if number >= 9.995 => 1,
+        _ => 2,
+    };
+    let text = format!("{number:.decimals$}");
+    text.trim_end_matches('0').trim_end_matches('.').to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_told_is_no_further_from_what_was_worked_out_than_half_a_percent() {
+        for (seconds, expected) in [
+            (0.0, "0 ms"),
+            (0.005_502, "5.5 ms"),
+            (0.037_4, "37.4 ms"),
+            (0.099_96, "100 ms"),
+            (0.5, "500 ms"),
+            (1.0, "1 s"),
+            (1.049, "1.05 s"),
+            (9.996, "10 s"),
+            (66.66, "66.7 s"),
+            (90.0, "90 s"),
+            (600.0, "10 min"),
+            (252.0, "4.2 min"),
+        ] {
+            assert_eq!(told(seconds), expected);
+        }
     }
 }

@@ -82,9 +82,13 @@ impl Bus {
         if let Some(silent) = blamed {
             self.devices[silent].charge(now, waited);
             self.devices[silent].had_wire(busy_from, own_from);
+            self.probed(silent, waited);
         }
         let timed_out = reply.result == Err(RequestError::Timeout);
         self.times.to_blame = asked.device.filter(|device| timed_out && self.devices[*device].is_probed());
+        if let Some(silent) = self.times.to_blame {
+            self.probed(silent, now - own_from);
+        }
         if let Some(device) = asked.device {
             self.devices[device].had_wire(if blamed.is_some() { own_from } else { busy_from }, now);
             self.devices[device].keep_time(now, waited, turnaround, command_waited);

@@ -67,9 +67,9 @@ impl Bus {
                 if read_before_setting || read_before_request {
                     continue;
                 }
-                // (A device's rest is no spare time of a line that it has for itself.)
-                if self.devices.len() > 1 || !self.devices.iter().any(|device| device.only_rests(now)) {
-                    self.pace.idle(now);
+                self.pace.idle(now);
+                for index in self.resting.iter().copied() {
+                    self.devices[index].is_idle(now);
                 }
                 // No read has had to wait for what went out of turn.
                 self.ahead = 0;
@@ -174,6 +174,7 @@ impl Bus {
     pub(super) fn look_what_they_have(&mut self) {
         self.feeds = self.devices.iter().any(DeviceState::wants_feeding);
         self.has_settings = self.devices.iter().any(DeviceState::has_settings);
+        self.resting = resting(&self.devices);
     }
 
     /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn, and no
@@ -272,6 +273,11 @@ impl Bus {
         });
         self.ask(request, now, timeout);
     }
+}
+
+/// The devices that want silence before each request: of most buses none.
+pub(super) fn resting(devices: &[DeviceState]) -> Vec<usize> {
+    (0..devices.len()).filter(|index| devices[*index].wants_rest()).collect()
 }
 
 /// Not a device that leaves. And one whose watchdog must run out is not spoken to.

@@ -50,6 +50,26 @@ impl DeviceState {
         now < self.rested_at() && self.is_present() && self.polls.due_at().is_some_and(|due| due <= now)
     }
 
+    /// Whether it wants silence before each request.
+    pub(in crate::engine::bus) fn wants_rest(&self) -> bool {
+        !self.settings.device.wire.limits.delay.is_zero()
+    }
+
+    /// Whether its requests and the silence before them take so long that its periods are longer by more than those
+    /// of its bus.
+    fn is_filled_by_rest(&self, of_bus: &Pace) -> bool {
+        let cost = self.tariff.cost(self.turnaround.planned_with());
+        let rest = self.settings.device.wire.limits.delay;
+        !rest.is_zero() && self.polls.filled(|read| cost.time_of(read.span) + rest) > of_bus.stretch()
+    }
+
+    /// Nothing is due on its bus.
+    pub(in crate::engine::bus) fn is_idle(&mut self, now: Time) {
+        if !self.only_rests(now) {
+            self.own_pace.idle(now);
+        }
+    }
+
     /// How urgent its next question can be at most.
     pub(in crate::engine::bus) fn outlook(&self, now: Time) -> Outlook {
         let reads = if self.is_present() { self.polls.by_period(now) } else { None };
@@ -103,7 +123,10 @@ impl DeviceState {
 
     /// Returns what its turn was before.
     pub(in crate::engine::bus) fn begin_read(&mut self, read: usize, now: Time, pace: &mut Pace) -> Turn {
-        Turn { place: Some(self.polls.begin(read, now, pace)), ..self.turn() }
+        // What keeps it behind is its own rest, which says nothing of the line's other devices.
+        let pace = if self.is_filled_by_rest(pace) { &mut self.own_pace } else { pace };
+        let place = self.polls.begin(read, now, pace);
+        Turn { place: Some(place), ..self.turn() }
     }
 
     pub(in crate::engine::bus) fn turn(&self) -> Turn {

@@ -44,6 +44,10 @@ impl DeviceState {
                     self.values.has_been_told(&read, again);
                 }
             }
+            // It was only asked whether it is there.
+            Err(RequestError::Exception(_)) if self.polls.read(index).points.is_empty() => {
+                self.polls.end(index)
+            }
             Err(RequestError::Exception(code)) => self.refused(now, index, code, context),
             Err(error) => {
                 self.failed(now, &error, context);
@@ -87,7 +91,8 @@ impl DeviceState {
     pub(super) fn wake_reads(&mut self) {
         let (device, known) = (&self.settings.device, self.values.known());
         let sleeps = |point: PointIndex| codec::resolve(device, point, known) == Err(Missing::NotInThisMode);
-        self.polls.sleep(|read| read.points.iter().all(|(point, _)| sleeps(*point)));
+        self.polls
+            .sleep(|read| !read.points.is_empty() && read.points.iter().all(|(point, _)| sleeps(*point)));
     }
 
     /// After a poll: what became complete with it is told. The device is told to be there together with its

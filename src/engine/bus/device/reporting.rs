@@ -34,6 +34,8 @@ impl DeviceState {
             model: device.model.clone(),
             unit: self.settings.unit,
             online: self.told.is_available(),
+            is_missed: !self.told.is_available()
+                && (self.patience.is_probing() || matches!(self.presence, Presence::Mismatch { .. })),
             reason: self.why_not_online(),
             identity: self.identity.clone(),
             counters: self.counters,
