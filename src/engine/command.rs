@@ -212,6 +212,14 @@ impl CommandFlow {
         matches!(self.state, State::ReadingBefore { .. } | State::ReadingBack { .. })
     }
 
+    /// Whether the device has taken nothing of it yet.
+    pub fn is_unwritten(&self) -> bool {
+        matches!(
+            self.state,
+            State::ReadingBefore { .. } | State::WritingBetween { .. } | State::Writing { .. }
+        )
+    }
+
     /// Whether all that is left is to see that the device has taken what it has confirmed.
     pub fn only_confirms(&self) -> bool {
         matches!(self.state, State::ReadingBack { doubt: None, .. })

@@ -13,7 +13,7 @@ use crate::engine::yaml::nearest;
 
 use super::change::CHANGED;
 use super::device::DeviceState;
-use super::waiting::{Target, Waiting};
+use super::waiting::{REPLACED, Target, Waiting};
 use super::{Bus, Command, LinkState, Purpose, Severity};
 
 /// A command that has begun.
@@ -185,15 +185,24 @@ impl Bus {
         }
         if let Some(at) = self.settling.iter().position(|settling| settling.until <= self.now) {
             let Settling { mut active, then, .. } = self.settling.remove(at);
-            if let Then::Ask(call) = then {
-                self.take_step(active, Step::Ask(call));
-                return true;
+            match then {
+                // What the device was too busy for; the newer value goes on in its place.
+                Then::Ask(_) if self.is_overtaken(&active) => {
+                    let outcome = active.wanted.ended(OutcomeKind::Expired, REPLACED);
+                    self.end_command(active, outcome);
+                }
+                Then::Ask(call) => {
+                    self.take_step(active, Step::Ask(call));
+                    return true;
+                }
+                Then::ReadBack | Then::ReadBackUnlessPolled => {
+                    let call = active.flow.settled(self.devices[active.device].device());
+                    let device = active.device;
+                    self.active = Some(active);
+                    self.send(device, call, Purpose::Command);
+                    return true;
+                }
             }
-            let call = active.flow.settled(self.devices[active.device].device());
-            let device = active.device;
-            self.active = Some(active);
-            self.send(device, call, Purpose::Command);
-            return true;
         }
         let (devices, settling, now) = (&self.devices, &self.settling, self.now);
         let can_begin = |waiting: &Waiting| can_begin(devices, settling, now, waiting);
@@ -212,6 +221,17 @@ impl Bus {
         };
         self.begin_order(device, target, wanted, Some(came_at), orders);
         true
+    }
+
+    /// Whether nothing of the command has been written yet, and a newer value waits for the same point, which the
+    /// device can take.
+    fn is_overtaken(&self, active: &Active) -> bool {
+        let device = &self.devices[active.device];
+        let is_newer = |waiting: &Waiting| {
+            let is_same = waiting.device == active.device && waiting.target == active.target;
+            is_same && device.is_valid(waiting.target, &waiting.wanted.text)
+        };
+        active.flow.is_unwritten() && self.waiting.iter().any(is_newer)
     }
 
     /// Whether a waiting command could begin if nothing were in flight.

@@ -68,6 +68,22 @@ impl DeviceState {
         }
     }
 
+    /// Whether `wanted` is something that the target can be told, as far as it is known now.
+    pub(in crate::engine::bus) fn is_valid(&self, target: Target, wanted: &str) -> bool {
+        match target {
+            Target::Point(point) | Target::Setting(point) => self.obeyed(point, wanted).is_some(),
+            Target::Thing(thing) => self.orders(thing, wanted).is_ok(),
+        }
+    }
+
+    /// What of a point is written for a command, and with which meaning of it.
+    fn obeyed(&self, point: PointIndex, wanted: &str) -> Option<(codec::Resolved<'_>, Vec<u16>)> {
+        let details = self.details(point);
+        let resolved = codec::resolve(self.device(), point, self.known()).ok()?;
+        let obeyed = codec::obey(details, details.write.as_ref()?, &resolved, wanted).ok()?;
+        Some((resolved, obeyed.words))
+    }
+
     /// Whether a command can begin: the device is there, is the right one, what decides about the points
     /// is known, and their EEPROM has been spared long enough.
     pub(in crate::engine::bus) fn can_take(&self, now: Time, target: Target, wanted: &str) -> bool {
@@ -85,14 +101,8 @@ impl DeviceState {
     /// Whether the point's last reading is what is wanted: to find it so again wears out nothing.
     fn seems_to_hold(&self, target: Target, wanted: &str) -> bool {
         let Target::Point(point) = target else { return false };
-        let (details, Ok(resolved)) =
-            (self.details(point), codec::resolve(self.device(), point, self.known()))
-        else {
-            return false;
-        };
-        let Some(write) = &details.write else { return false };
-        let obeyed = codec::obey(details, write, &resolved, wanted);
-        obeyed.is_ok_and(|obeyed| codec::read(&resolved, &obeyed.words) == *self.values.reading(point))
+        let obeyed = self.obeyed(point, wanted);
+        obeyed.is_some_and(|(resolved, words)| codec::read(&resolved, &words) == *self.values.reading(point))
     }
 
     fn unknown_selector(&self, target: Target) -> Option<PointIndex> {
