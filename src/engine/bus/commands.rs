@@ -145,7 +145,7 @@ impl Bus {
     }
 
     /// Tells which values of this device wait until their EEPROM may be written again.
-    fn tell_what_waits(&mut self, device: usize) {
+    pub(super) fn tell_what_waits(&mut self, device: usize) {
         let state = &self.devices[device];
         let of_device = self.waiting.iter().filter(|waiting| waiting.device == device);
         let points = of_device.filter_map(|waiting| match waiting.target {
