@@ -144,8 +144,24 @@ impl Bus {
         }
     }
 
+    /// A point of this device has been written, or a command waits: what waits in vain is told so at once.
+    pub(super) fn refuse_what_is_in_vain(&mut self, device: usize) {
+        let why = |waiting: &Waiting| {
+            let is_of_it = waiting.device == device;
+            is_of_it.then(|| self.devices[device].is_in_vain(self.now, waiting)).flatten()
+        };
+        let in_vain: Vec<(Target, String)> =
+            self.waiting.iter().filter_map(|waiting| Some((waiting.target, why(waiting)?))).collect();
+        for (target, reason) in in_vain {
+            let is_it = |waiting: &Waiting| waiting.device == device && waiting.target == target;
+            let Some(waiting) = self.waiting.take_first(is_it) else { continue };
+            self.tell_outcome(device, target, waiting.wanted.ended(OutcomeKind::Refused, reason));
+        }
+    }
+
     /// Tells which values of this device wait until their EEPROM may be written again.
     pub(super) fn tell_what_waits(&mut self, device: usize) {
+        self.refuse_what_is_in_vain(device);
         let state = &self.devices[device];
         let of_device = self.waiting.iter().filter(|waiting| waiting.device == device);
         let points = of_device.filter_map(|waiting| match waiting.target {
@@ -286,14 +302,23 @@ impl Bus {
 
     pub(super) fn command_answered(&mut self, result: Result<Answer, RequestError>) {
         let Some(mut active) = self.active.take() else { return };
+        self.count_written(active.device, &result);
         let state = &mut self.devices[active.device];
-        self.counters.persistent_writes += state.has_written(self.now, &result, &mut self.context);
         if let (true, Ok(answer)) = (active.flow.reads(), &result) {
             let words = command::words_of(answer);
             state.read_for_command(self.now, active.flow.point(), &words, &mut self.context);
         }
         let step = active.flow.answered(state.device(), state.known(), &result);
         self.take_step(active, step);
+    }
+
+    /// What was asked last may have been a write to EEPROM.
+    pub(super) fn count_written(&mut self, device: usize, result: &Result<Answer, RequestError>) {
+        let writes = self.devices[device].has_written(self.now, result, &mut self.context);
+        self.counters.persistent_writes += writes;
+        if writes > 0 {
+            self.tell_what_waits(device);
+        }
     }
 
     fn take_step(&mut self, active: Active, step: Step) {

@@ -229,8 +229,8 @@ impl Bus {
     /// The question of the request that has begun was answered, or not.
     pub(super) fn request_answered(&mut self, sent_at: Time, result: Result<Answer, RequestError>) {
         let Some(Running { request, device, mut flow, .. }) = self.requests.running.take() else { return };
+        self.count_written(device, &result);
         let state = &mut self.devices[device];
-        self.counters.persistent_writes += state.has_written(self.now, &result, &mut self.context);
         if flow.wants_presence() {
             match &result {
                 Ok(_) | Err(RequestError::Exception(_) | RequestError::Impossible(_)) => {}

@@ -8,6 +8,7 @@ use crate::engine::plan::Read;
 use crate::engine::time::Time;
 
 use super::{Context, DeviceState, Presence, Target};
+use crate::engine::bus::waiting::Waiting;
 
 impl DeviceState {
     pub(in crate::engine::bus) fn target_named(&self, name: &str) -> Option<Target> {
@@ -136,6 +137,16 @@ impl DeviceState {
                 (allowed - now).as_secs() + 1
             )
         })
+    }
+
+    /// Why a command that waits for its EEPROM's sake waits in vain: its time will have passed before the budget
+    /// allows another write.
+    pub(in crate::engine::bus) fn is_in_vain(&self, now: Time, waiting: &Waiting) -> Option<String> {
+        let is_point = matches!(waiting.target, Target::Point(_));
+        if !is_point || !self.spares_eeprom(now, waiting.target, &waiting.wanted.text) {
+            return None;
+        }
+        self.wear.spent_until(now, waiting.deadline_from(self.writable_at(waiting.target)))
     }
 
     /// Why the point may not be written now, although its own time has come.

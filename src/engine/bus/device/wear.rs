@@ -108,6 +108,13 @@ impl Wear {
         })
     }
 
+    /// Why nothing will be written until `then`, as far as that can be known: a write that is under way may turn out
+    /// to be none.
+    pub(super) fn spent_until(&self, now: Time, then: Time) -> Option<String> {
+        let is_known = self.writing.is_none() && self.budget_at() > then;
+        if is_known { self.spent(now) } else { None }
+    }
+
     /// How many writes have been taken out of the budget, and have not come in again.
     pub(super) fn writes_spent(&self, now: Time) -> u32 {
         (Wear::full(self.rules) - self.account.left(self.rules, now)).div_ceil(WRITE) as u32
@@ -209,6 +216,19 @@ mod tests {
         wear.change_rules(now, Eeprom { daily: 8, ..RULES });
         assert_eq!((wear.writes_spent(now), wear.end(false)), (4, 0));
         assert_eq!((wear.writes_spent(now), wear.allowed_at(9)), (3, Time::default()));
+    }
+
+    #[test]
+    fn that_nothing_is_left_is_known_before_as_far_as_it_can_be_known() {
+        let mut wear = Wear::new(Eeprom { daily: 2, ..RULES });
+        let now = Time::default();
+        wear.spend(now, 1);
+        let full = wear.budget_at();
+        assert_eq!(wear.spent_until(now, now), None, "the device may be too busy for it");
+        wear.end(true);
+        assert_eq!(full, now + Duration::from_secs(24 * 3600));
+        assert_eq!(wear.spent_until(now, full), None);
+        assert_eq!(wear.spent_until(now, Time(full.0 - 1)), wear.spent(now));
     }
 
     #[test]
