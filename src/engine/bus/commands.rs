@@ -9,7 +9,6 @@ use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
-use crate::engine::yaml::nearest;
 
 use super::change::CHANGED;
 use super::device::DeviceState;
@@ -80,6 +79,9 @@ impl Bus {
         }
         let is_press = self.devices[device].is_press(target);
         let wish = Wish::parse(&command.payload);
+        if let Some(fault) = &wish.fault {
+            return self.tell_outcome(device, target, wish.ended(OutcomeKind::Refused, fault));
+        }
         if is_press {
             if let Some(reason) = self.devices[device].is_too_soon(self.now, target) {
                 self.tell_outcome(device, target, wish.ended(OutcomeKind::Refused, reason));
@@ -98,11 +100,7 @@ impl Bus {
     fn refuse_unknown(&mut self, command: &Command) {
         let Command { device, point, payload, .. } = command;
         let reason = match self.devices.iter().find(|state| state.name() == device) {
-            Some(state) => {
-                let meant =
-                    nearest(point, &state.names_to_set()).map(|name| format!("; did you mean `{name}`?"));
-                format!("`{device}` has no point `{point}`{}", meant.unwrap_or_default())
-            }
+            Some(state) => state.no_point(point, &state.names_to_set()),
             None => CHANGED.to_string(),
         };
         let topic = self.context.topics_of(device).outcome(point);
@@ -331,7 +329,7 @@ impl Bus {
             Step::Ask(_) if self.link_state != LinkState::Up => {
                 let mut active = active;
                 let state = &self.devices[device];
-                let lost = Err(RequestError::Link("the link is down".into()));
+                let lost = Err(RequestError::Link("it is down".into()));
                 let step = active.flow.answered(state.device(), state.known(), &lost);
                 self.take_step(active, step);
             }

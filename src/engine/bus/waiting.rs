@@ -73,7 +73,7 @@ impl WaitingCommands {
             return displaced;
         }
         if self.queue.len() == WaitingCommands::LIMIT {
-            displaced.push((self.queue.remove(0), "too many commands wait"));
+            displaced.push((self.queue.remove(0), "1000 commands of this bus wait already"));
         }
         self.queue.push(command);
         displaced

@@ -6,6 +6,7 @@ use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::plan::Read;
 use crate::engine::time::Time;
+use crate::engine::yaml::nearest;
 
 use super::{Context, DeviceState, Presence, Target};
 use crate::engine::bus::waiting::Waiting;
@@ -22,6 +23,19 @@ impl DeviceState {
         let device = &self.settings.device;
         let points = device.points.iter().filter(|point| point.write.is_some());
         points.map(|point| &*point.name).chain(device.things.iter().map(|thing| &*thing.name)).collect()
+    }
+
+    /// What can be read again.
+    pub(in crate::engine::bus) fn names_to_read(&self) -> Vec<&str> {
+        let device = &self.settings.device;
+        let points = device.points.iter().filter(|point| !point.is_button());
+        points.map(|point| &*point.name).chain(device.things.iter().map(|thing| &*thing.name)).collect()
+    }
+
+    /// That there is no such point, and which of `names` may be meant.
+    pub(in crate::engine::bus) fn no_point(&self, found: &str, names: &[&str]) -> String {
+        let meant = nearest(found, names).map(|name| format!("; did you mean `{name}`?"));
+        format!("`{}` has no point `{found}`{}", self.name(), meant.unwrap_or_default())
     }
 
     pub(in crate::engine::bus) fn name_of(&self, target: Target) -> &str {
@@ -59,7 +73,7 @@ impl DeviceState {
         if codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
             return Err(format!("`{}` does not exist in the present mode of the device", thing.name));
         }
-        match thing.command(wanted) {
+        match thing.command(wanted.trim()) {
             Some(command) => Ok(command.orders.clone()),
             None => {
                 let known: Vec<String> =
@@ -159,7 +173,12 @@ impl DeviceState {
         match &self.presence {
             Presence::Absent { reason } | Presence::Mismatch { reason } => reason.clone(),
             Presence::Present => match self.unknown_selector(target) {
-                Some(selector) => format!("waiting for {}", self.details(selector).name),
+                Some(selector) => {
+                    format!(
+                        "`{}`, which decides what it means, was not read in time",
+                        self.details(selector).name
+                    )
+                }
                 None if self.patience.failures() > 0 => "the device does not answer".to_string(),
                 None => "the bus had no time for it".to_string(),
             },
