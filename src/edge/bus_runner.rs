@@ -234,7 +234,7 @@ impl BusRunner {
                     self.outgoing.push(message);
                 }
                 Action::Store(record) => self.state.store(record),
-                Action::Record { recording, request } => self.record(*recording, request),
+                Action::Record { recording, request, keep } => self.record(*recording, request, keep),
                 Action::Reopen { after } => {
                     self.port = Port::Waiting(self.clock.now() + after);
                     self.stir.stir();
@@ -318,10 +318,10 @@ impl BusRunner {
     }
 
     /// Makes a file of a recording, on a thread of its own.
-    fn record(&mut self, recording: Recording, request: Option<Request>) {
+    fn record(&mut self, recording: Recording, request: Option<Request>, keep: usize) {
         self.saving.retain(|saving| !saving.is_finished());
         let (inbox, bell, clock) = (self.inbox.clone(), self.bell.clone(), self.clock);
-        let (folder, keep) = (self.state.recordings().map(Path::to_path_buf), self.settings.recorder.keep);
+        let folder = self.state.recordings().map(Path::to_path_buf);
         let asked = request.clone();
         let saving = std::thread::Builder::new().name("recording".into()).spawn(move || {
             let result = match folder {

@@ -172,7 +172,7 @@ impl Parts {
         let (command, kind, reason) = match self.tell_bus_of(&device, Event::Command(command.clone())) {
             Ok(None) => return,
             Ok(Some(older)) => (older, OutcomeKind::Expired, REPLACED),
-            Err(Full) => (command, OutcomeKind::Refused, "too many commands wait"),
+            Err(Full) => (command, OutcomeKind::Refused, "too many commands of this bus wait already"),
         };
         self.tell_outcome(&device, &command.point, &Wish::parse(&command.payload).ended(kind, reason));
     }

@@ -169,6 +169,9 @@ impl App {
         for (index, (name, fate)) in parts.buses.iter().enumerate() {
             let bus = match (fate, running.remove(name)) {
                 (Fate::Stays { come, .. }, Some(bus)) => {
+                    if let Some(rules) = parts.rules {
+                        self.hand_over(&bus, Event::Rules(rules));
+                    }
                     if !come.is_empty() {
                         let devices = on_bus(come, index);
                         self.hand_over(&bus, Event::Adopt(devices, memories.clone()));
@@ -203,6 +206,9 @@ impl App {
         self.plant.exchange(settings, library, buses);
         remember_topics(&self.plant, &self.state, gone);
         self.reporter.replace(watched);
+        if parts.rules.is_some() {
+            tracing::info!("what holds for every bus has changed, and the buses go on");
+        }
         for (name, fate) in &parts.buses {
             tell_fate(name, fate);
         }

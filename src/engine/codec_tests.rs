@@ -211,6 +211,42 @@ fn a_wish_is_checked_rounded_and_encoded() {
 }
 
 #[test]
+fn blanks_around_a_wish_mean_something_only_in_a_text() {
+    let press = WriteRule::Press { word: 1, self_clearing: false };
+    let named = with(Kind::U16, |form| form.names = Names::All(vec![(3, "half open".into())]));
+    for (form, rule, expected) in [
+        (Form::new(Kind::Bool), WriteRule::Any, (" ON ", Ok("0001"))),
+        (Form::new(Kind::Bool), WriteRule::Any, ("ON\n", Ok("0001"))),
+        (Form::new(Kind::Bool), WriteRule::Any, (" on", Err("`on` is neither `ON` nor `OFF`"))),
+        (
+            Form::new(Kind::Bool),
+            WriteRule::Any,
+            ("  ", Err("an empty text is no value; expected `ON` or `OFF`")),
+        ),
+        (Form::new(Kind::U16), WriteRule::Any, ("\t21 ", Ok("0015"))),
+        (Form::new(Kind::U16), WriteRule::Any, (" ", Err("an empty text is not a number"))),
+        (named.clone(), WriteRule::Any, (" half open\r\n", Ok("0003"))),
+        (named, WriteRule::Any, ("half  open", Err("`half  open` is none of `half open`"))),
+        (Form::new(Kind::U16), press.clone(), ("PRESS ", Ok("0001"))),
+        (Form::new(Kind::U16), press, ("ON", Err("`ON` is not what presses a button; expected `PRESS`"))),
+        (Form::new(Kind::LetterNumber), WriteRule::Any, (" R017", Ok("5211"))),
+        (Form::new(Kind::Text { registers: 2 }), WriteRule::Any, (" a ", Ok("2061 2000"))),
+        (
+            Form::new(Kind::Text { registers: 2 }),
+            WriteRule::Any,
+            ("abcde", Err("`abcde` has 5 bytes; expected at most 4")),
+        ),
+        (
+            Form::new(Kind::Text { registers: 2 }),
+            WriteRule::Any,
+            ("a\n", Err(r#""a\n" has control characters; expected a text without"#)),
+        ),
+    ] {
+        check_write(form, rule, expected.0, expected.1);
+    }
+}
+
+#[test]
 fn a_field_of_bits_takes_only_what_fits_it() {
     let at = Address { span: Span::single(Table::Holding, 36), bits: Bits::new(8, 15) };
     let rule = WriteRule::Range { min: Decimal::ZERO, max: Decimal::integer(999), step: None };
@@ -283,8 +319,8 @@ fn what_is_made_of_a_wish_is_said() {
         (&any, refuse, "1e-300", Ok(("0000", None))),
         (&any, refuse, "1e31", Err("`1e31` is outside -5 to 30")),
         (&any, refuse, "-1e400", Err("`-1e400` is outside -5 to 30")),
-        (&any, refuse, "inf", Err("`inf` is not a number")),
-        (&any, refuse, "1e", Err("`1e` is not a number")),
+        (&any, refuse, "inf", Err("`inf` is not a number; expected one from -5 to 30")),
+        (&any, refuse, "1e", Err("`1e` is not a number; expected one from -5 to 30")),
         (&any, refuse, "21.44", Ok(("00D6", Some("`21.44` is rounded to 21.4")))),
         (&any, refuse, "1e-05", Ok(("0000", Some("`1e-05` is rounded to 0.0")))),
         (&half, refuse, "21.3", Ok(("00D7", Some("`21.3` is rounded to 21.5")))),
@@ -299,7 +335,8 @@ fn what_is_made_of_a_wish_is_said() {
         ),
         (&any, clamp, "1e31", Ok(("012C", Some("`1e31` is out of range, and 30.0 the nearest value in it")))),
         (&any, clamp, "automatic", Ok(("2B67", None))),
-        (&any, clamp, "nan", Err("`nan` is not a number")),
+        (&any, clamp, " automatic", Ok(("2B67", None))),
+        (&any, clamp, "nan", Err("`nan` is not a number; expected one from -5 to 30")),
     ] {
         let mut device = device(tenths.clone(), registers(1), rule.clone());
         let mut write = device.points[0].write.take().expect("it is written");

@@ -32,10 +32,11 @@ pub struct CommandFlow {
 }
 
 /// "Accepted, and it will take long": the exception that says nothing is wrong.
-const ACKNOWLEDGE: u8 = 5;
+pub const ACKNOWLEDGE: u8 = 5;
+pub const ACCEPTED: &str = "the device has accepted it, and takes its time (exception 5, acknowledge)";
 /// A device that is busy is asked again after this, and so often.
-const PAUSE_BUSY: Duration = Duration::from_millis(200);
-const BUSY_MAX: u32 = 50;
+pub const PAUSE_BUSY: Duration = Duration::from_millis(200);
+pub const BUSY_MAX: u32 = 50;
 /// A button that is pressed late surprises.
 const BUSY_MAX_OF_PRESS: u32 = 15;
 
@@ -57,6 +58,8 @@ enum State {
 #[derive(Clone, Debug, PartialEq)]
 enum Doubt {
     NoAnswer(RequestError),
+    /// The device is still doing it.
+    Accepted,
     /// The device says that it clamps, and that it does so with an exception.
     Clamped,
 }
@@ -212,6 +215,14 @@ impl CommandFlow {
         matches!(self.state, State::ReadingBefore { .. } | State::ReadingBack { .. })
     }
 
+    /// Whether the device has taken nothing of it yet.
+    pub fn is_unwritten(&self) -> bool {
+        matches!(
+            self.state,
+            State::ReadingBefore { .. } | State::WritingBetween { .. } | State::Writing { .. }
+        )
+    }
+
     /// Whether all that is left is to see that the device has taken what it has confirmed.
     pub fn only_confirms(&self) -> bool {
         matches!(self.state, State::ReadingBack { doubt: None, .. })
@@ -344,21 +355,20 @@ impl CommandFlow {
     ) -> Step {
         let press = is_press(write);
         let doubt = match result {
-            Ok(_) | Err(RequestError::Exception(ACKNOWLEDGE)) if press && !is_self_clearing(write) => {
-                return self.finish(OutcomeKind::Done, None, None);
+            Ok(_) if press && !is_self_clearing(write) => return self.finish(OutcomeKind::Done, None, None),
+            Err(RequestError::Exception(ACKNOWLEDGE)) if press && !is_self_clearing(write) => {
+                return self.finish(OutcomeKind::Done, None, Some(ACCEPTED.into()));
             }
             Ok(_) => None,
+            Err(RequestError::Exception(ACKNOWLEDGE)) => Some(Doubt::Accepted),
             Err(RequestError::Exception(3)) if device.wire.quirks.clamps_with_exception => {
                 Some(Doubt::Clamped)
             }
-            Err(RequestError::Exception(code)) if *code != ACKNOWLEDGE => {
-                return self.refused_by_device(*code);
-            }
+            Err(RequestError::Exception(code)) => return self.refused_by_device(*code),
             Err(error) if press => return self.finish(OutcomeKind::NoReply, None, Some(error.to_string())),
             Err(error) => Some(Doubt::NoAnswer(error.clone())),
         };
-        let is_doing_it = doubt == Some(Doubt::NoAnswer(RequestError::Exception(ACKNOWLEDGE)));
-        let settle = if is_doing_it { write.settle.max(PAUSE_BUSY) } else { write.settle };
+        let settle = if doubt == Some(Doubt::Accepted) { write.settle.max(PAUSE_BUSY) } else { write.settle };
         if settle > Duration::ZERO {
             self.state = State::Settling { field, doubt };
             return Step::Settle(settle);
@@ -383,6 +393,7 @@ impl CommandFlow {
             Err(error) => {
                 let reason = match doubt {
                     Some(Doubt::NoAnswer(of_write)) => of_write.to_string(),
+                    Some(Doubt::Accepted) => format!("{ACCEPTED}, but it was not read back: {error}"),
                     _ => format!("written, but not read back: {error}"),
                 };
                 return self.finish(OutcomeKind::NoReply, None, Some(reason));
@@ -396,12 +407,13 @@ impl CommandFlow {
         if held == field || cleared {
             return self.finish(OutcomeKind::Done, found, None);
         }
-        if doubt == Some(Doubt::NoAnswer(RequestError::Exception(ACKNOWLEDGE))) && self.busy < BUSY_MAX {
+        if doubt == Some(Doubt::Accepted) && self.busy < BUSY_MAX {
             self.busy += 1;
             return Step::AskLater(PAUSE_BUSY, Call::Read(details.at.span));
         }
         let reason = match doubt {
             Some(Doubt::NoAnswer(error)) => error.to_string(),
+            Some(Doubt::Accepted) => format!("{ACCEPTED}, but holds another value still"),
             Some(Doubt::Clamped) => "the device limits the value".to_string(),
             None => "the device holds another value".to_string(),
         };

@@ -27,6 +27,10 @@ const THROWN_OUT_TIMES: u32 = 4;
 /// A broker that leaves a question unanswered for so long was stalled, or the way to it was.
 const STALLED_AFTER: Duration = Duration::from_secs(3);
 
+/// The broker is asked at least so often, so that no stall is unnoticed that is as long as this and the time above
+/// together: less than a command's time to live.
+const ASK_EVERY: Duration = Duration::from_secs(6);
+
 /// What others had to say during a stall arrives within this time after it.
 const STALE_UNTIL_AFTER: Duration = Duration::from_millis(500);
 
@@ -60,6 +64,8 @@ pub struct Connection {
     contested: bool,
     /// The oldest question that nothing has come after.
     asked_at: Option<Time>,
+    /// When something was asked last, or the connection was made.
+    last_asked: Time,
     /// The broker did not say that it is away, and may hold what others have told it meanwhile.
     was_silent: bool,
     /// Until when what arrives may come from a stall, and when that began.
@@ -72,19 +78,28 @@ impl Connection {
     pub fn made(&mut self, now: Time) -> Duration {
         self.since = Some(now);
         self.attempts_since_loss += 1;
-        self.asked_at = None;
+        (self.asked_at, self.last_asked) = (None, now);
         let was_silent = std::mem::take(&mut self.was_silent);
         if was_silent { LISTEN_AFTER_SILENCE } else { Duration::ZERO }
     }
 
     /// Something was sent that the broker answers.
     pub fn asked(&mut self, now: Time) {
-        self.asked_at.get_or_insert(now);
+        // A program that stood still itself asks late.
+        self.asked_at.get_or_insert(now.min(self.last_asked + ASK_EVERY));
+        self.last_asked = now;
+    }
+
+    /// When something is to be asked for the question's own sake, while the connection is there.
+    pub fn asks_at(&self) -> Option<Time> {
+        self.is_made().then(|| self.last_asked + ASK_EVERY)
     }
 
     /// Anything has come from the broker.
     pub fn heard(&mut self, now: Time) {
-        if let Some(asked_at) = self.asked_at.take().filter(|asked_at| now - *asked_at >= STALLED_AFTER) {
+        // Or has not even asked.
+        let asked_at = self.asked_at.take().unwrap_or(self.last_asked + ASK_EVERY);
+        if now.since(asked_at) >= STALLED_AFTER {
             self.stale = Some((now + STALE_UNTIL_AFTER, asked_at));
         }
     }
@@ -252,16 +267,54 @@ mod tests {
     #[test]
     fn what_comes_after_a_silence_may_be_as_old_as_the_silence() {
         let mut connection = Connection::default();
-        connection.made(at(0));
+        connection.made(at(8));
         connection.asked(at(10));
         connection.asked(at(14));
         assert_eq!(connection.stale_for(at(12)), None, "nothing has arrived");
         connection.heard(at(16));
         assert_eq!(connection.stale_for(at(16)), Some(Duration::from_secs(6)));
         assert_eq!(connection.stale_for(at(17)), None);
+        connection.asked(at(18));
+        connection.heard(at(20));
+        assert_eq!(connection.stale_for(at(20)), None, "two seconds are no stall");
+    }
+
+    #[test]
+    fn the_broker_is_asked_so_often_that_nothing_can_be_as_old_as_a_command_may_be() {
+        let mut connection = Connection::default();
+        assert_eq!(connection.asks_at(), None, "there is no connection");
+        connection.made(at(10));
+        assert_eq!(connection.asks_at(), Some(at(16)));
+        connection.asked(at(12));
+        assert_eq!(connection.asks_at(), Some(at(18)));
+        // Whatever comes in time shows only that this is no stall, not that nothing is to be asked.
+        connection.heard(at(13));
+        connection.heard(at(18));
+        assert_eq!((connection.asks_at(), connection.stale_for(at(18))), (Some(at(18)), None));
+        connection.lost(at(19), Loss::Closed, 0);
+        assert_eq!(connection.asks_at(), None);
+        assert!(ASK_EVERY + STALLED_AFTER < Duration::from_secs(10));
+    }
+
+    #[test]
+    fn a_program_that_stood_still_knows_that_it_has_not_asked() {
+        let mut connection = Connection::default();
+        connection.made(at(10));
+        connection.heard(at(18));
+        assert_eq!(connection.stale_for(at(18)), None, "the question may be a little late");
+        connection.heard(at(19));
+        assert_eq!(connection.stale_for(at(19)), Some(Duration::from_secs(3)));
+        // And what comes with it, until the question is answered.
+        connection.heard(at(20));
+        assert!(connection.stale_for(at(20)).is_some());
         connection.asked(at(20));
-        connection.heard(at(22));
-        assert_eq!(connection.stale_for(at(22)), None, "two seconds are no stall");
+        connection.heard(at(21));
+        assert_eq!(connection.stale_for(at(21)), Some(Duration::from_secs(5)));
+        assert_eq!(connection.stale_for(Time(at(21).0 + 500_000)), None);
+        // It may find the time to ask before it looks at what has come.
+        connection.asked(at(30));
+        connection.heard(at(30));
+        assert_eq!(connection.stale_for(at(30)), Some(Duration::from_secs(4)));
     }
 
     #[test]

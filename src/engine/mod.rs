@@ -41,6 +41,7 @@ pub mod topics;
 // Obey: commands with what they are known again by, settings, what outlives a restart, and the bus that ties all of it together.
 pub mod bus;
 pub mod command;
+pub mod members;
 pub mod memory;
 pub mod reload;
 pub mod request;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use crate::engine::settings::{Bus, DeviceSettings, Settings};
+use crate::engine::settings::{Bus, DeviceSettings, Rules, Settings};
 use crate::engine::topics::Topics;
 
 /// What has to be done so that the gateway is as the new settings want it.
@@ -19,6 +19,8 @@ pub struct Parts {
     /// The connection to the broker is made anew.
     pub broker: bool,
     pub http: bool,
+    /// What buses that stay go on with, if it has changed.
+    pub rules: Option<Rules>,
     /// In the order of the new settings.
     pub buses: Vec<(String, Fate)>,
     /// Buses that are there no more.
@@ -33,7 +35,7 @@ pub enum Fate {
         leave: Vec<String>,
         come: Vec<DeviceSettings>,
     },
-    /// Its link or what concerns all of its devices has changed.
+    /// Its link has changed.
     Restarts,
     Begins,
 }
@@ -41,7 +43,11 @@ pub enum Fate {
 impl Parts {
     pub fn is_nothing(&self) -> bool {
         let stays = |(_, fate): &(String, Fate)| matches!(fate, Fate::Stays { leave, come } if leave.is_empty() && come.is_empty());
-        !self.broker && !self.http && self.ended.is_empty() && self.buses.iter().all(stays)
+        !self.broker
+            && !self.http
+            && self.rules.is_none()
+            && self.ended.is_empty()
+            && self.buses.iter().all(stays)
     }
 }
 
@@ -55,13 +61,9 @@ pub fn compare(old: &Settings, new: &Settings) -> Change {
     if concerns_all(old) != concerns_all(new) {
         return Change::Everything;
     }
-    let rules = |settings: &Settings| {
-        (settings.republish, settings.on_broker_loss, settings.eeprom, settings.recorder)
-    };
-    let same_rules = rules(old) == rules(new);
     let fate = |bus: &Bus| match old.buses.iter().find(|other| other.name == bus.name) {
         None => Fate::Begins,
-        Some(before) if before != bus || !same_rules => Fate::Restarts,
+        Some(before) if before != bus => Fate::Restarts,
         Some(_) => {
             let (before, after) = (devices_on(old, &bus.name), devices_on(new, &bus.name));
             let leave = before.iter().filter(|device| !after.contains(device));
@@ -76,6 +78,7 @@ pub fn compare(old: &Settings, new: &Settings) -> Change {
     Change::Parts(Parts {
         broker: old.mqtt != new.mqtt,
         http: old.http != new.http,
+        rules: (old.rules() != new.rules()).then(|| new.rules()),
         buses: new.buses.iter().map(|bus| (bus.name.clone(), fate(bus))).collect(),
         ended: old.buses.iter().filter(is_gone).map(|bus| bus.name.clone()).collect(),
     })
@@ -148,6 +151,7 @@ devices:
                 let mut words: Vec<String> = Vec::new();
                 words.extend(parts.broker.then(|| "broker".into()));
                 words.extend(parts.http.then(|| "http".into()));
+                words.extend(parts.rules.map(|_| "rules".into()));
                 for (name, fate) in &parts.buses {
                     match fate {
                         Fate::Restarts => words.push(format!("{name} restarts")),
@@ -188,9 +192,14 @@ devices:
             )],
             "",
         );
-        check(&[("\nmqtt:", "\neeprom: {daily: 7}\nmqtt:")], "a restarts, b restarts");
-        check(&[("\nmqtt:", "\nrepublish: 5m\nmqtt:")], "a restarts, b restarts");
-        check(&[("\nmqtt:", "\nrecorder: {kilobytes: 0}\nmqtt:")], "a restarts, b restarts");
+        for rule in [
+            "eeprom: {daily: 7}",
+            "republish: 5m",
+            "recorder: {kilobytes: 0}",
+            "on_broker_loss: stop_feeding",
+        ] {
+            check(&[("\nmqtt:", &format!("\n{rule}\nmqtt:"))], "rules");
+        }
         for more in
             ["base_topic: house", "topics: '{base}/{bus}/{device}/{point}'", "retain: false", "json: true"]
         {

@@ -29,7 +29,25 @@ pub struct Settings {
     pub devices: Vec<DeviceSettings>,
 }
 
+/// What holds for every bus, and may change while it goes on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Rules {
+    pub republish: Duration,
+    pub on_broker_loss: OnBrokerLoss,
+    pub eeprom: Eeprom,
+    pub recorder: Recorder,
+}
+
 impl Settings {
+    pub fn rules(&self) -> Rules {
+        Rules {
+            republish: self.republish,
+            on_broker_loss: self.on_broker_loss,
+            eeprom: self.eeprom,
+            recorder: self.recorder,
+        }
+    }
+
     /// Takes relative paths of secrets and certificates from `folder`, in which the configuration lies.
     pub fn resolve_files(&mut self, folder: &Path) {
         let resolve = |path: &mut PathBuf| *path = folder.join(&*path);

@@ -163,6 +163,11 @@ impl Values {
         }
     }
 
+    /// What was worth telling is looked at anew with the next poll of each.
+    pub fn look_again(&mut self) {
+        self.heard.iter_mut().for_each(|heard| heard.told_until = heard.at);
+    }
+
     /// The reads have changed. What one of them brought long ago may come again while others have brought
     /// something else since.
     pub fn forget_words(&mut self) {

@@ -128,6 +128,11 @@ impl Topics {
         format!("{}/bridge/response/{verb}", self.base)
     }
 
+    /// A topic of the gateway's own on which nobody ever tells anything.
+    pub fn question(&self) -> String {
+        format!("{}/bridge/question", self.base)
+    }
+
     /// The filters to subscribe to, so that everything [`Topics::parse`] knows arrives, and the gateway's own state.
     pub fn subscriptions(&self) -> Vec<String> {
         let mut own = self.base.clone();

@@ -177,6 +177,43 @@ fn what_is_unchanged_goes_on_while_the_rest_comes_goes_and_changes() {
 }
 
 #[test]
+fn another_budget_for_eeprom_is_taken_while_every_bus_goes_on_and_every_count() {
+    let (broker, simulation, witness) = (Broker::start(), simulation(), Witness::start());
+    let port = over_tcp(&simulation);
+    let line = format!("line: {{tcp: '{}'}}", port.address());
+    let (steady, pump) = steady(&witness);
+    let watcher = Watcher::start(&broker, "watcher");
+    let before = text(&broker, &[&line, &steady], &[RELAYS, &pump]);
+    let gateway = Gateway::start_with(&format!("eeprom: {{daily: 2}}\n{before}"));
+    online(&watcher, &["relays", "pump"]);
+    let set = |number: u8, value: &str, wanted: &str| {
+        let point = format!("busker/relays/relay_{number}_default");
+        watcher.publish(&format!("{point}/set"), value);
+        let outcome = watcher.wait_until("an outcome", |got| got.topic == format!("{point}/outcome"));
+        assert_eq!(json(&outcome.payload)["outcome"], wanted, "{}", outcome.payload);
+    };
+    set(1, "ON", "done");
+    set(2, "ON", "refused");
+    let from = witness.count();
+    gateway.write(&format!("eeprom: {{daily: 6}}\n{before}"));
+    watcher.forget();
+    gateway.reload(DONE);
+    set(3, "ON", "done");
+    set(4, "ON", "done");
+    watcher.wait_until("all three counted", |got| {
+        got.topic == "busker/relays/info" && json(&got.payload)["eeprom_writes"] == 3
+    });
+    for point in ["relays/availability", "pump/availability", "pump/flow"] {
+        assert_eq!(watcher.payloads(&format!("busker/{point}")), [""; 0], "{point} is told anew");
+    }
+    witness.wait_for_more(3);
+    assert_eq!(witness.connections(), 1, "the bus kept its connection");
+    let longest = witness.longest_gap(from.saturating_sub(2));
+    assert!(longest < Duration::from_millis(600), "a poll was lost: {longest:?}");
+    assert!(gateway.terminate().success());
+}
+
+#[test]
 fn a_faulty_configuration_changes_nothing_and_is_shown_where_people_look() {
     let (broker, witness) = (Broker::start(), Witness::start());
     let (steady, pump) = steady(&witness);

@@ -169,6 +169,11 @@ impl Player {
                 let devices = devices::settings(rest).devices;
                 self.bus.handle(self.now, Event::Adopt(devices, self.memories.clone()));
             }
+            // Header lines that are about no device: `small budget`.
+            "rules" => {
+                let rules = devices::settings(&rest.replace(", ", "\n")).rules();
+                self.bus.handle(self.now, Event::Rules(rules));
+            }
             "answer" => self.answer(rest),
             "devices-answer" => self.answering = true,
             "silent" => self.silent.push(rest.parse().expect("a unit")),
@@ -264,7 +269,7 @@ impl Player {
                     ));
                     self.memories.devices.insert(device, memory);
                 }
-                Action::Record { recording, request } => {
+                Action::Record { recording, request, .. } => {
                     self.write(&format!("record {}", recording.why));
                     // Nothing is sent here; of each request only its end is on the tape.
                     let frames =

@@ -10,9 +10,10 @@ use super::mailbox::Mailbox;
 use super::poller::Seen;
 use crate::edge::clock::Clock;
 use crate::engine::command::{OutcomeKind, Wish};
+use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::settings::Manner;
-use crate::engine::time::Duration;
+use crate::engine::time::{Duration, Time};
 use crate::engine::topics::{self, Incoming, Message, ONLINE, Topics};
 
 /// What the broker has to tell the rest of the program.
@@ -49,6 +50,7 @@ pub(super) struct Feeder<Tell> {
     pub former_states: Vec<String>,
     pub mailbox: Arc<Mailbox>,
     pub state: Arc<Mutex<BrokerReport>>,
+    pub connection: Arc<Mutex<Connection>>,
     pub connected: bool,
     /// Whether the last connection was lost to somebody else with our identifier.
     pub contested: bool,
@@ -64,7 +66,7 @@ pub(super) struct Feeder<Tell> {
 impl<Tell: Fn(News)> Feeder<Tell> {
     pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut goodbye: oneshot::Receiver<()>) {
         loop {
-            let wake_at = self.mailbox.outbox().wake_at();
+            let wake_at = self.mailbox.outbox().wake_at().into_iter().chain(self.asks_at()).min();
             let until = wake_at.map_or(Duration::from_secs(3600), |time| self.clock.until(time));
             tokio::select! {
                 seen = events.recv() => match seen {
@@ -238,6 +240,23 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         self.denied = is_denied;
     }
 
+    /// When the broker is asked next whether it is there.
+    fn asks_at(&self) -> Option<Time> {
+        if self.connected && self.subscribed { lock(&self.connection).asks_at() } else { None }
+    }
+
+    /// Asks what a broker answers and nobody else hears of: to be told no more of what this gateway was never told
+    /// of. A broker that is slow to answer may hold others' messages as well.
+    fn ask(&mut self) {
+        let now = self.clock.now();
+        if self.asks_at().is_some_and(|at| now >= at) {
+            // Told before the answer can be here.
+            lock(&self.connection).asked(now);
+            // Where the library has no room for it, it waits for other answers.
+            let _ = self.client.try_unsubscribe(self.topics.question());
+        }
+    }
+
     /// Hands over as much as the library has room for; `true` if nothing is left.
     fn feed(&mut self) -> bool {
         if !self.connected {
@@ -247,6 +266,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
             self.subscribed = self.client.try_subscribe_many(self.filters.iter().map(filter)).is_ok();
         }
+        self.ask();
         let mut outbox = self.mailbox.outbox();
         while let Some(message) = outbox.next_message(self.clock.now()) {
             let Manner { confirmed, retain } = outbox.manner(&message);

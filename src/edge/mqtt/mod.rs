@@ -114,6 +114,7 @@ impl Broker {
             former_states,
             mailbox: mailbox.clone(),
             state: state.clone(),
+            connection: connection.clone(),
             connected: false,
             contested: false,
             told_up: None,

@@ -38,7 +38,10 @@ impl Poller {
                     tokio::time::sleep(wait).await;
                     Seen::Up
                 }
-                Ok(event) => self.seen(event),
+                Ok(event) => match self.seen(event) {
+                    Some(seen) => seen,
+                    None => continue,
+                },
                 Err(error) => {
                     if self.lost(error).await.is_err() {
                         return;
@@ -52,19 +55,24 @@ impl Poller {
         }
     }
 
-    fn seen(&self, event: rumqttc::Event) -> Seen {
+    /// What is to be told of it. A question for its own sake is asked by the feeder, and its answer is nobody
+    /// else's business.
+    fn seen(&self, event: rumqttc::Event) -> Option<Seen> {
         let now = self.clock.now();
         let mut connection = lock(&self.connection);
         match event {
             rumqttc::Event::Incoming(packet) => {
                 connection.heard(now);
-                Seen::Packet { packet, stale_for: connection.stale_for(now) }
+                let is_answer = matches!(packet, Packet::UnsubAck(_));
+                (!is_answer).then(|| Seen::Packet { packet, stale_for: connection.stale_for(now) })
             }
+            rumqttc::Event::Outgoing(Outgoing::Unsubscribe(_)) => None,
             rumqttc::Event::Outgoing(sent) => {
-                if let Outgoing::Publish(_) | Outgoing::Subscribe(_) | Outgoing::PingReq = sent {
+                // What is published with QoS 0, which has the number 0, is not answered.
+                if matches!(sent, Outgoing::Publish(1..) | Outgoing::Subscribe(_) | Outgoing::PingReq) {
                     connection.asked(now);
                 }
-                Seen::Room
+                Some(Seen::Room)
             }
         }
     }
@@ -75,7 +83,9 @@ impl Poller {
         // when a command in it is no longer meant.
         for event in std::mem::take(&mut self.event_loop.state.events) {
             if let rumqttc::Event::Incoming(_) = event {
-                self.seen.send(self.seen(event)).await?;
+                if let Some(seen) = self.seen(event) {
+                    self.seen.send(seen).await?;
+                }
             }
         }
         // A collision of packet numbers from the old connection would stop publishing for ever.
@@ -168,6 +178,45 @@ mod tests {
     use rumqttc::{AsyncClient, MqttOptions, QoS, StateError};
 
     use super::*;
+    use crate::engine::time::Time;
+
+    #[test]
+    fn only_what_the_broker_answers_is_a_question() {
+        let (_client, event_loop) = AsyncClient::new(MqttOptions::new("id", "localhost", 1883), 10);
+        let poller = poller(event_loop, mpsc::channel(10).0);
+        let asks_at = || lock(&poller.connection).asks_at();
+        lock(&poller.connection).made(Time::default());
+        for (sent, is_question) in [
+            (Outgoing::Publish(0), false),
+            (Outgoing::PubAck(7), false),
+            (Outgoing::Publish(7), true),
+            (Outgoing::PingReq, true),
+        ] {
+            let before = asks_at();
+            // The clock goes on, by microseconds.
+            while poller.clock.now()
+                <= before.map_or(poller.clock.now(), |at| Time(at.0.saturating_sub(6_000_000)))
+            {}
+            poller.seen(rumqttc::Event::Outgoing(sent.clone()));
+            assert_eq!(asks_at() != before, is_question, "{sent:?}");
+        }
+    }
+
+    fn poller(event_loop: EventLoop, seen: mpsc::Sender<Seen>) -> Poller {
+        Poller {
+            event_loop,
+            seen,
+            connection: Arc::new(Mutex::new(Connection::default())),
+            mqtt: Mqtt::default(),
+            ends: Ends {
+                address: "localhost:1883".into(),
+                client_id: "id".into(),
+                base_topic: "busker".into(),
+            },
+            unreadable: None,
+            clock: Clock::start(),
+        }
+    }
 
     /// The library keeps such a message, and would hand it out after the next connect.
     #[test]
@@ -179,20 +228,7 @@ mod tests {
             let command = Packet::Publish(command);
             event_loop.state.events.push_back(rumqttc::Event::Incoming(command.clone()));
             let (seen, mut events) = mpsc::channel(10);
-            let mqtt = Mqtt::default();
-            let mut poller = Poller {
-                event_loop,
-                seen,
-                connection: Arc::new(Mutex::new(Connection::default())),
-                mqtt,
-                ends: Ends {
-                    address: "localhost:1883".into(),
-                    client_id: "id".into(),
-                    base_topic: "busker".into(),
-                },
-                unreadable: None,
-                clock: Clock::start(),
-            };
+            let mut poller = poller(event_loop, seen);
             lock(&poller.connection).made(poller.clock.now());
             let end = ConnectionError::MqttState(StateError::ConnectionAborted);
             let task = tokio::spawn(async move { poller.lost(end).await.is_ok() });

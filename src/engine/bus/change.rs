@@ -4,9 +4,10 @@ use crate::engine::command::OutcomeKind;
 use crate::engine::device::Device;
 use crate::engine::memory::Memories;
 use crate::engine::plan::Tariff;
-use crate::engine::settings::DeviceSettings;
+use crate::engine::settings::{DeviceSettings, Rules};
 
 use super::device::DeviceState;
+use super::recording::Recorder;
 use super::{Action, Bus, InFlight, LinkState, Purpose};
 
 /// What commands and requests of a device are told that leaves.
@@ -86,6 +87,19 @@ impl Bus {
         self.requests.devices().for_each(change);
     }
 
+    /// The bus goes on, and all that it has counted and read stays.
+    pub(super) fn change_rules(&mut self, rules: Rules) {
+        let before = std::mem::replace(&mut self.rules, rules);
+        if rules.recorder != before.recorder {
+            self.recorder = Recorder::new(rules.recorder);
+        }
+        self.context.republish = rules.republish;
+        for index in 0..self.devices.len() {
+            self.devices[index].change_rules(self.now, &rules, &mut self.context);
+            self.tell_what_waits(index);
+        }
+    }
+
     /// These devices come, as at the start of the bus.
     pub(super) fn adopt(&mut self, devices: Vec<DeviceSettings>, memories: &Memories) {
         let tariff = Tariff::of(&self.link, self.gap);
@@ -95,7 +109,7 @@ impl Bus {
         // Of those that stay it counts when they are planned anew for another reason.
         self.devices.iter_mut().zip(rests.by_ref()).for_each(|(device, rest)| device.idle_rest = rest);
         for (settings, rest) in devices.into_iter().zip(rests) {
-            let mut device = DeviceState::new(settings, tariff, rest, self.eeprom);
+            let mut device = DeviceState::new(settings, tariff, rest, self.rules.eeprom);
             self.counters.persistent_writes += device.recall(memories);
             device.introduce(self.now, &mut self.context);
             if self.link_state == LinkState::Up {

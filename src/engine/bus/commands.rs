@@ -9,11 +9,10 @@ use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Message;
-use crate::engine::yaml::nearest;
 
 use super::change::CHANGED;
 use super::device::DeviceState;
-use super::waiting::{Target, Waiting};
+use super::waiting::{REPLACED, Target, Waiting};
 use super::{Bus, Command, LinkState, Purpose, Severity};
 
 /// A command that has begun.
@@ -80,6 +79,9 @@ impl Bus {
         }
         let is_press = self.devices[device].is_press(target);
         let wish = Wish::parse(&command.payload);
+        if let Some(fault) = &wish.fault {
+            return self.tell_outcome(device, target, wish.ended(OutcomeKind::Refused, fault));
+        }
         if is_press {
             if let Some(reason) = self.devices[device].is_too_soon(self.now, target) {
                 self.tell_outcome(device, target, wish.ended(OutcomeKind::Refused, reason));
@@ -111,11 +113,7 @@ impl Bus {
     fn refuse_unknown(&mut self, command: &Command) {
         let Command { device, point, payload, .. } = command;
         let reason = match self.devices.iter().find(|state| state.name() == device) {
-            Some(state) => {
-                let meant =
-                    nearest(point, &state.names_to_set()).map(|name| format!("; did you mean `{name}`?"));
-                format!("`{device}` has no point `{point}`{}", meant.unwrap_or_default())
-            }
+            Some(state) => state.no_point(point, &state.names_to_set()),
             None => CHANGED.to_string(),
         };
         let topic = self.context.topics_of(device).outcome(point);
@@ -157,8 +155,24 @@ impl Bus {
         }
     }
 
+    /// A point of this device has been written, or a command waits: what waits in vain is told so at once.
+    pub(super) fn refuse_what_is_in_vain(&mut self, device: usize) {
+        let why = |waiting: &Waiting| {
+            let is_of_it = waiting.device == device;
+            is_of_it.then(|| self.devices[device].is_in_vain(self.now, waiting)).flatten()
+        };
+        let in_vain: Vec<(Target, String)> =
+            self.waiting.iter().filter_map(|waiting| Some((waiting.target, why(waiting)?))).collect();
+        for (target, reason) in in_vain {
+            let is_it = |waiting: &Waiting| waiting.device == device && waiting.target == target;
+            let Some(waiting) = self.waiting.take_first(is_it) else { continue };
+            self.tell_outcome(device, target, waiting.wanted.ended(OutcomeKind::Refused, reason));
+        }
+    }
+
     /// Tells which values of this device wait until their EEPROM may be written again.
-    fn tell_what_waits(&mut self, device: usize) {
+    pub(super) fn tell_what_waits(&mut self, device: usize) {
+        self.refuse_what_is_in_vain(device);
         let state = &self.devices[device];
         let of_device = self.waiting.iter().filter(|waiting| waiting.device == device);
         let points = of_device.filter_map(|waiting| match waiting.target {
@@ -198,15 +212,24 @@ impl Bus {
         }
         if let Some(at) = self.settling.iter().position(|settling| settling.until <= self.now) {
             let Settling { mut active, then, .. } = self.settling.remove(at);
-            if let Then::Ask(call) = then {
-                self.take_step(active, Step::Ask(call));
-                return true;
+            match then {
+                // What the device was too busy for; the newer value goes on in its place.
+                Then::Ask(_) if self.is_overtaken(&active) => {
+                    let outcome = active.wanted.ended(OutcomeKind::Expired, REPLACED);
+                    self.end_command(active, outcome);
+                }
+                Then::Ask(call) => {
+                    self.take_step(active, Step::Ask(call));
+                    return true;
+                }
+                Then::ReadBack | Then::ReadBackUnlessPolled => {
+                    let call = active.flow.settled(self.devices[active.device].device());
+                    let device = active.device;
+                    self.active = Some(active);
+                    self.send(device, call, Purpose::Command);
+                    return true;
+                }
             }
-            let call = active.flow.settled(self.devices[active.device].device());
-            let device = active.device;
-            self.active = Some(active);
-            self.send(device, call, Purpose::Command);
-            return true;
         }
         let (devices, settling, now) = (&self.devices, &self.settling, self.now);
         let can_begin = |waiting: &Waiting| can_begin(devices, settling, now, waiting);
@@ -225,6 +248,17 @@ impl Bus {
         };
         self.begin_order(device, target, wanted, Some(came_at), orders);
         true
+    }
+
+    /// Whether nothing of the command has been written yet, and a newer value waits for the same point, which the
+    /// device can take.
+    fn is_overtaken(&self, active: &Active) -> bool {
+        let device = &self.devices[active.device];
+        let is_newer = |waiting: &Waiting| {
+            let is_same = waiting.device == active.device && waiting.target == active.target;
+            is_same && device.is_valid(waiting.target, &waiting.wanted.text)
+        };
+        active.flow.is_unwritten() && self.waiting.iter().any(is_newer)
     }
 
     /// Whether a waiting command could begin if nothing were in flight.
@@ -279,14 +313,23 @@ impl Bus {
 
     pub(super) fn command_answered(&mut self, result: Result<Answer, RequestError>) {
         let Some(mut active) = self.active.take() else { return };
+        self.count_written(active.device, &result);
         let state = &mut self.devices[active.device];
-        self.counters.persistent_writes += state.has_written(self.now, &result, &mut self.context);
         if let (true, Ok(answer)) = (active.flow.reads(), &result) {
             let words = command::words_of(answer);
             state.read_for_command(self.now, active.flow.point(), &words, &mut self.context);
         }
         let step = active.flow.answered(state.device(), state.known(), &result);
         self.take_step(active, step);
+    }
+
+    /// What was asked last may have been a write to EEPROM.
+    pub(super) fn count_written(&mut self, device: usize, result: &Result<Answer, RequestError>) {
+        let writes = self.devices[device].has_written(self.now, result, &mut self.context);
+        self.counters.persistent_writes += writes;
+        if writes > 0 {
+            self.tell_what_waits(device);
+        }
     }
 
     fn take_step(&mut self, active: Active, step: Step) {
@@ -299,7 +342,7 @@ impl Bus {
             Step::Ask(_) if self.link_state != LinkState::Up => {
                 let mut active = active;
                 let state = &self.devices[device];
-                let lost = Err(RequestError::Link("the link is down".into()));
+                let lost = Err(RequestError::Link("it is down".into()));
                 let step = active.flow.answered(state.device(), state.known(), &lost);
                 self.take_step(active, step);
             }

@@ -33,7 +33,7 @@ use crate::engine::plan::Tariff;
 use crate::engine::recorder::Recording;
 use crate::engine::request;
 use crate::engine::schedule::Pace;
-use crate::engine::settings::{DeviceSettings, Eeprom, Link, OnBrokerLoss, Settings};
+use crate::engine::settings::{DeviceSettings, Link, OnBrokerLoss, Rules, Settings};
 use crate::engine::time::{Date, Duration, Time};
 use crate::engine::topics::Message;
 
@@ -71,6 +71,8 @@ pub enum Event {
     Retire(String),
     /// Devices come to the bus, with what is remembered of them.
     Adopt(Vec<DeviceSettings>, Memories),
+    /// What holds for every bus is from now on this.
+    Rules(Rules),
     /// The request of the last [`Action::Send`] was taken back before it was on the wire.
     Withdrawn,
     /// The recording of an [`Action::Record`] is in a file, or why not.
@@ -111,6 +113,8 @@ pub enum Action {
     Record {
         recording: Box<Recording>,
         request: Option<request::Request>,
+        /// So many files of this bus; an older one goes.
+        keep: usize,
     },
     /// Close the link, if it is open, and open it after this long. The first action of all.
     Reopen {
@@ -136,8 +140,7 @@ pub struct Bus {
     /// Silence before each request; `None`: the line's own.
     gap: Option<Duration>,
     response_timeout: Duration,
-    on_broker_loss: OnBrokerLoss,
-    eeprom: Eeprom,
+    rules: Rules,
     context: Context,
     devices: Devices,
     waiting: WaitingCommands,
@@ -268,8 +271,7 @@ impl Bus {
             link: bus.link.clone(),
             gap: bus.gap,
             response_timeout: bus.response_timeout,
-            on_broker_loss: settings.on_broker_loss,
-            eeprom: settings.eeprom,
+            rules: settings.rules(),
             context,
             devices: devices.into(),
             waiting: WaitingCommands::default(),
@@ -318,6 +320,7 @@ impl Bus {
             Event::Request(request) => self.request(request),
             Event::Retire(device) => self.retire(&device),
             Event::Adopt(devices, memories) => self.adopt(devices, &memories),
+            Event::Rules(rules) => self.change_rules(rules),
             Event::Recorded(request, result) => self.recorded(request, result),
             Event::BrokerUp => {
                 self.broker_up = true;

@@ -112,7 +112,8 @@ impl Bus {
 
     fn save(&mut self, why: &str, request: Option<Request>) {
         if let Some(recording) = self.recording(self.now, why) {
-            self.context.actions.push_back(Action::Record { recording: Box::new(recording), request });
+            let (recording, keep) = (Box::new(recording), self.rules.recorder.keep);
+            self.context.actions.push_back(Action::Record { recording, request, keep });
         }
     }
 

@@ -26,6 +26,7 @@ pub(super) use scan::Scanning;
 
 /// More requests than this are not kept waiting.
 const WAITING_MAX: usize = 16;
+const TOO_MANY: &str = "16 requests of this bus wait already; ask again when they are answered";
 /// After a question to a device that may be away, and that nobody answers, requests leave the bus alone so
 /// many times as long as it took.
 const SILENCE_FACTOR: u32 = 3;
@@ -164,7 +165,7 @@ impl Bus {
             return self.refuse(&request, "the device is not here any more");
         };
         if self.requests.waiting.len() == WAITING_MAX {
-            return self.refuse(&request, "too many requests wait");
+            return self.refuse(&request, TOO_MANY);
         }
         match check(&self.devices[device]) {
             Ok(flow) => {
@@ -229,8 +230,8 @@ impl Bus {
     /// The question of the request that has begun was answered, or not.
     pub(super) fn request_answered(&mut self, sent_at: Time, result: Result<Answer, RequestError>) {
         let Some(Running { request, device, mut flow, .. }) = self.requests.running.take() else { return };
+        self.count_written(device, &result);
         let state = &mut self.devices[device];
-        self.counters.persistent_writes += state.has_written(self.now, &result, &mut self.context);
         if flow.wants_presence() {
             match &result {
                 Ok(_) | Err(RequestError::Exception(_) | RequestError::Impossible(_)) => {}
@@ -276,13 +277,16 @@ impl Bus {
             return self.refuse(&request, "the device is not here any more");
         };
         if self.requests.refreshes.len() == WAITING_MAX {
-            return self.refuse(&request, "too many requests wait");
+            return self.refuse(&request, TOO_MANY);
         }
         let target = match name {
             None => None,
             Some(name) => match self.devices[index].target_named(name) {
                 Some(target) => Some(target),
-                None => return self.refuse(&request, &format!("`{device}` has no point `{name}`")),
+                None => {
+                    let reason = self.devices[index].no_point(name, &self.devices[index].names_to_read());
+                    return self.refuse(&request, &reason);
+                }
             },
         };
         match target {

@@ -167,7 +167,7 @@ impl Bus {
 
     /// Whether devices with a watchdog are left to it, since the broker is away.
     fn watchdogs_run_out(&self) -> bool {
-        !self.broker_up && self.on_broker_loss != OnBrokerLoss::Keep
+        !self.broker_up && self.rules.on_broker_loss != OnBrokerLoss::Keep
     }
 
     /// What any device has.

@@ -44,9 +44,13 @@ impl Waiting {
 
     /// Puts the deadline off, for a command that may not begin before `from`.
     pub fn put_off(&mut self, from: Time) {
-        let time_to_live = if self.is_press { Waiting::PRESS_TIME_TO_LIVE } else { Waiting::TIME_TO_LIVE };
-        self.deadline = from + time_to_live;
+        self.deadline = self.deadline_from(from);
         self.came_at = from;
+    }
+
+    /// Its deadline if it may not begin before `from`.
+    pub fn deadline_from(&self, from: Time) -> Time {
+        from + if self.is_press { Waiting::PRESS_TIME_TO_LIVE } else { Waiting::TIME_TO_LIVE }
     }
 }
 
@@ -69,7 +73,7 @@ impl WaitingCommands {
             return displaced;
         }
         if self.queue.len() == WaitingCommands::LIMIT {
-            displaced.push((self.queue.remove(0), "too many commands wait"));
+            displaced.push((self.queue.remove(0), "1000 commands of this bus wait already"));
         }
         self.queue.push(command);
         displaced

@@ -21,7 +21,8 @@ pub fn obey(point: &Point, write: &Write, resolved: &Resolved<'_>, text: &str) -
         OutOfRange::Clamp => nearest_end(resolved, &write.rule, text),
         OutOfRange::Refuse => None,
     };
-    let words = encode(point, &write.rule, resolved, end.as_deref().unwrap_or(text))?;
+    let words = encode(point, &write.rule, resolved, end.as_deref().unwrap_or(text))
+        .map_err(|fault| with_range(fault, resolved, &write.rule))?;
     let taken = read(resolved, &words);
     let note = match (end, &taken) {
         (Some(_), taken) => Some(format!("`{text}` is out of range, and {taken} the nearest value in it")),
@@ -45,7 +46,7 @@ pub fn obey(point: &Point, write: &Write, resolved: &Resolved<'_>, text: &str) -
 
 /// The end of the range that a number is beyond.
 fn nearest_end(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Option<String> {
-    let is_name = resolved.form.names.list().iter().any(|(_, name)| name == text);
+    let is_name = resolved.form.names.list().iter().any(|(_, name)| name == text.trim());
     let (limits, wanted) = (limits(resolved, rule)?, wished_number(text).ok().filter(|_| !is_name)?);
     if wanted.compare(limits.min).is_lt() {
         return Some(limits.min.to_string());
@@ -61,14 +62,19 @@ fn wished_number(text: &str) -> Result<Decimal, String> {
     if let Some(number) = Decimal::parse(typed) {
         return Ok(number);
     }
+    if typed.is_empty() {
+        return Err(format!("an empty text {NO_NUMBER}"));
+    }
     // `inf` and `nan` are floats, and no numbers.
     let is_number = typed.bytes().all(|byte| byte.is_ascii_digit() || b"+-.eE".contains(&byte));
     let number = typed.parse::<f64>().ok().filter(|_| is_number);
-    let number = number.ok_or_else(|| format!("`{text}` is not a number"))?;
+    let number = number.ok_or_else(|| format!("`{text}` {NO_NUMBER}"))?;
     let decimals = if number.abs() < 1e10 { usize::from(Decimal::DECIMALS_MAX) } else { 0 };
     let nearest = Decimal::parse(&format!("{:.decimals$}", number.clamp(-TOO_LARGE, TOO_LARGE)));
-    nearest.map(Decimal::normalized).ok_or_else(|| format!("`{text}` is not a number"))
+    nearest.map(Decimal::normalized).ok_or_else(|| format!("`{text}` {NO_NUMBER}"))
 }
+
+const NO_NUMBER: &str = "is not a number";
 
 /// No wish is larger: what is beyond it counts as this.
 const TOO_LARGE: f64 = 1e29;
@@ -139,8 +145,15 @@ pub fn encode(
     text: &str,
 ) -> Result<Vec<u16>, String> {
     let form = resolved.form;
+    // Whoever types a value, or makes it of a template, leaves blanks; only in a text they mean something.
+    let text = if matches!(form.kind, Kind::Text { .. }) { text } else { text.trim() };
     if let WriteRule::Press { word, .. } = rule {
-        return if text == "PRESS" { Ok(vec![*word]) } else { Err(format!("`{text}` is not `PRESS`")) };
+        let is_press = text == "PRESS";
+        return if is_press {
+            Ok(vec![*word])
+        } else {
+            Err(format!("`{text}` is not what presses a button; expected `PRESS`"))
+        };
     }
     if form.since.is_some() {
         return Err("a moment cannot be written".to_string());
@@ -151,6 +164,7 @@ pub fn encode(
         match text {
             "ON" => vec![1],
             "OFF" => vec![0],
+            "" => return Err("an empty text is no value; expected `ON` or `OFF`".into()),
             _ => return Err(format!("`{text}` is neither `ON` nor `OFF`")),
         }
     } else if let Some(raw) = named_value(form, rule, text)? {
@@ -250,6 +264,17 @@ fn inside(resolved: &Resolved<'_>, rule: &WriteRule, raw: i128) -> i128 {
     raw + inwards * resolved.form.scale.units.signum()
 }
 
+/// What would be right, where only what is wrong is said.
+fn with_range(fault: String, resolved: &Resolved<'_>, rule: &WriteRule) -> String {
+    if !fault.ends_with(NO_NUMBER) {
+        return fault;
+    }
+    match limits(resolved, rule) {
+        Some(Limits { min, max, .. }) => format!("{fault}; expected one from {min} to {max}"),
+        None => format!("{fault}; expected one like `21.5`"),
+    }
+}
+
 fn check_limits(
     resolved: &Resolved<'_>,
     rule: &WriteRule,
@@ -282,7 +307,7 @@ fn encode_float(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Result
     let wanted: f64 = match stepped(resolved, rule, number) {
         Some(Some(stepped)) => stepped.to_f64(),
         // A float holds what has too many digits for a decimal.
-        _ => text.trim().parse().map_err(|_| format!("`{text}` is not a number"))?,
+        _ => text.trim().parse().map_err(|_| format!("`{text}` {NO_NUMBER}"))?,
     };
     if let Some(limits) = limits(resolved, rule) {
         if wanted < limits.min.to_f64() || wanted > limits.max.to_f64() {
@@ -327,8 +352,11 @@ fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
         }
         Kind::Text { registers } => {
             let room = usize::from(registers) * 2;
-            if text.len() > room || text.contains(char::is_control) {
-                return Err(format!("`{text}` is longer than {room} bytes or has control characters"));
+            if text.len() > room {
+                return Err(format!("`{text}` has {} bytes; expected at most {room}", text.len()));
+            }
+            if text.contains(char::is_control) {
+                return Err(format!("{text:?} has control characters; expected a text without"));
             }
             // What stands for bytes that are no UTF-8 is not what was wished for.
             if text.contains(char::REPLACEMENT_CHARACTER) {

@@ -1,9 +1,7 @@
 //! What a message on a `set` topic wishes: a value, and perhaps a transaction that comes back with the outcome.
 
-use serde::Deserialize;
-use serde_json::value::RawValue;
-
 use super::{Outcome, OutcomeKind};
+use crate::engine::members::{Members, stands_twice};
 use crate::engine::transaction::Transaction;
 
 /// More bytes than any wish has: the longest text fills 125 registers. What is longer is no value, and is not
@@ -17,6 +15,8 @@ pub struct Wish {
     pub text: String,
     /// What its sender knows the outcome again by.
     pub transaction: Option<Transaction>,
+    /// Why it is not looked at.
+    pub fault: Option<String>,
 }
 
 impl Wish {
@@ -37,22 +37,23 @@ impl Wish {
     }
 }
 
-/// As they stand in the payload: a value keeps its digits, too.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Enclosed<'p> {
-    #[serde(borrow)]
-    value: &'p RawValue,
-    #[serde(borrow)]
-    transaction: &'p RawValue,
-}
-
 fn enclosed(payload: &str) -> Option<Wish> {
     // Nearly no value begins so, and a slider sends a thousand.
     if payload.len() > BYTES_MAX || !payload.trim_start().starts_with('{') {
         return None;
     }
-    let Enclosed { value, transaction } = serde_json::from_str(payload).ok()?;
+    let members = Members::of(payload).ok()?;
+    let is_one = |key: &str| key == "value" || key == "transaction";
+    let (value, transaction) = (members.get("value")?, members.get("transaction")?);
+    if !members.keys().all(is_one) {
+        return None;
+    }
+    // As they stand in the payload: a value keeps its digits, too.
+    let transaction = Some(Transaction::of(transaction));
+    if let Some(key) = members.repeated() {
+        let transaction = transaction.filter(|_| key != "transaction");
+        return Some(Wish { text: payload.to_string(), transaction, fault: Some(stands_twice(key)) });
+    }
     let text = match value.get() {
         "true" => "ON".to_string(),
         "false" => "OFF".to_string(),
@@ -61,13 +62,13 @@ fn enclosed(payload: &str) -> Option<Wish> {
         several if several.starts_with(['[', '{']) => return None,
         number => number.to_string(),
     };
-    Some(Wish { text, transaction: Some(Transaction::of(transaction)) })
+    Some(Wish { text, transaction, fault: None })
 }
 
 impl From<String> for Wish {
     /// Of what the gateway wishes itself, which waits for no outcome.
     fn from(text: String) -> Wish {
-        Wish { text, transaction: None }
+        Wish { text, transaction: None, fault: None }
     }
 }
 
@@ -116,6 +117,21 @@ mod tests {
             let wish = Wish::parse(payload);
             let found = wish.transaction.map(|transaction| transaction.to_string());
             assert_eq!((wish.text.as_str(), found.as_deref()), (text, transaction), "{payload}");
+            assert_eq!(wish.fault, None);
+        }
+    }
+
+    #[test]
+    fn nobody_can_know_which_of_two_values_or_transactions_is_meant() {
+        for (payload, key, transaction) in [
+            (r#"{"value": 1, "value": 2, "transaction": 3}"#, "value", Some("3")),
+            (r#"{"value": 1, "transaction": 3, "value": 1}"#, "value", Some("3")),
+            (r#"{"value": 1, "transaction": 2, "transaction": 3}"#, "transaction", None),
+        ] {
+            let wish = Wish::parse(payload);
+            let found = wish.transaction.map(|transaction| transaction.to_string());
+            assert_eq!((wish.text.as_str(), found.as_deref()), (payload, transaction));
+            assert_eq!(wish.fault, Some(stands_twice(key)), "{payload}");
         }
     }
 }

@@ -188,7 +188,7 @@ impl Desk {
         let (first, last) = text.split_once("..").unwrap_or((text, text));
         match (first.trim().parse::<u8>(), last.trim().parse::<u8>()) {
             (Ok(first), Ok(last)) if 1 <= first && first <= last && last <= most => Ok((first, last)),
-            _ => Err(format!("`{text}` are no units of this bus; expected units like `1..{most}` or `7`")),
+            _ => Err(format!("`{text}` names no units of this bus; expected them as in `1..{most}` or `7`")),
         }
     }
 
@@ -276,7 +276,14 @@ devices:
         check_error(
             "identify",
             "{device}",
-            &format!("this is no JSON (key must be a string at line 1 column 2); {like}"),
+            &format!("this is no JSON: it is wrong at line 1, column 2; {like}"),
+        );
+        check_error("identify", r#"{"device":"#, &format!("this is no JSON: it ends too early; {like}"));
+        check_error("identify", "", &format!("the message is empty; {like}"));
+        check_error(
+            "identify",
+            r#"{"device":"relays","device":"boiler"}"#,
+            "`device` stands there more than once; remove all of them but one",
         );
         check_error("identify", "7", &format!("this is no JSON object; {like}"));
         check_error("identify", "{}", &format!("`device` is missing; {like}"));
@@ -300,7 +307,7 @@ devices:
         check_error(
             "scan",
             r#"{"bus":"basement","units":"1..255"}"#,
-            "`1..255` are no units of this bus; expected units like `1..247` or `7`",
+            "`1..255` names no units of this bus; expected them as in `1..247` or `7`",
         );
         check_error("reed", "{}", "`reed` is no request; did you mean `read`?");
         check_error(
@@ -312,6 +319,16 @@ devices:
             "write",
             r#"{"device":"relays","at":"holding 0..1","value":7}"#,
             "`holding 0..1` takes 2 values, one for each address; found 1",
+        );
+        check_error(
+            "write",
+            r#"{"device":"relays","at":"holding 0","value":[7,8]}"#,
+            "`holding 0` takes one value; found 2",
+        );
+        check_error(
+            "write",
+            r#"{"device":"relays","at":"holding 0","value":7,"value":8}"#,
+            "`value` stands there more than once; remove all of them but one",
         );
         check_error(
             "write",

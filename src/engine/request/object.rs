@@ -1,12 +1,10 @@
 //! The JSON object of one request: its keys, and what stands under them.
 
-use std::collections::BTreeMap;
-
-use serde_json::value::RawValue;
 use serde_json::{Map, Value as Json};
 
 use super::Verb;
 use crate::engine::address::Span;
+use crate::engine::members::{Members, stands_twice};
 use crate::engine::transaction::Transaction;
 use crate::engine::yaml::{Scalar, list_of_choices};
 
@@ -18,8 +16,10 @@ pub(super) fn transaction_of(payload: &str) -> Transaction {
     if payload.len() > PAYLOAD_BYTES_MAX {
         return Transaction::default();
     }
-    let object: BTreeMap<String, &RawValue> = serde_json::from_str(payload).unwrap_or_default();
-    object.get("transaction").map(|value| Transaction::of(value)).unwrap_or_default()
+    let members = Members::of(payload).ok();
+    // Of two of them, neither is it.
+    let members = members.filter(|members| members.keys().filter(|key| *key == "transaction").count() == 1);
+    members.and_then(|members| members.get("transaction").map(Transaction::of)).unwrap_or_default()
 }
 
 /// The payload of one request.
@@ -34,11 +34,16 @@ impl Object {
         if payload.len() > PAYLOAD_BYTES_MAX {
             return Err(format!("{} bytes are no request; {expected}", payload.len()));
         }
-        let entries = match serde_json::from_str(payload) {
-            Ok(Json::Object(entries)) => entries,
-            Ok(_) => return Err(format!("this is no JSON object; {expected}")),
-            Err(error) => return Err(format!("this is no JSON ({error}); {expected}")),
+        let members = Members::of(payload).map_err(|fault| format!("{fault}; {expected}"))?;
+        if let Some(key) = members.repeated() {
+            return Err(stands_twice(key));
+        }
+        let entry = |key: &str| {
+            let text = members.get(key)?.get();
+            // A number that no computer can hold is shown as it stands there.
+            Some((key.to_string(), serde_json::from_str(text).unwrap_or_else(|_| Json::from(text))))
         };
+        let entries: Map<String, Json> = members.keys().filter_map(entry).collect();
         if let Some(unknown) = entries.keys().find(|key| !verb.keys().contains(&key.as_str())) {
             let remedy = list_of_choices(unknown, verb.keys());
             return Err(format!("`{}` knows no `{unknown}`; {remedy}", verb.name()));
@@ -101,11 +106,11 @@ pub(super) fn words(span: Span, value: &Json) -> Result<Vec<u16>, String> {
         value => vec![word(value)?],
     };
     if words.len() as u32 != span.count() {
-        return Err(format!(
-            "`{span}` takes {} values, one for each address; found {}",
-            span.count(),
-            words.len()
-        ));
+        let wanted = match span.count() {
+            1 => "one value".into(),
+            count => format!("{count} values, one for each address"),
+        };
+        return Err(format!("`{span}` takes {wanted}; found {}", words.len()));
     }
     Ok(words)
 }

@@ -4,6 +4,7 @@ use crate::engine::command::Outcome;
 use crate::engine::device::PointIndex;
 use crate::engine::memory::{self, Memories, Memory, Record};
 use crate::engine::plan;
+use crate::engine::settings::Rules;
 use crate::engine::time::{Duration, Time};
 use crate::engine::upkeep::Upkeep;
 
@@ -67,6 +68,14 @@ impl DeviceState {
         }
         self.keeping.stored = memory;
         self.counters.persistent_writes
+    }
+
+    /// Goes on by other rules.
+    pub(in crate::engine::bus) fn change_rules(&mut self, now: Time, rules: &Rules, context: &mut Context) {
+        self.wear.change_rules(now, rules.eeprom);
+        // Some of it may be due to be told again.
+        self.values.look_again();
+        self.tell_info(now, context);
     }
 
     fn memory(&self, now: Time) -> Memory {

@@ -6,8 +6,10 @@ use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::plan::Read;
 use crate::engine::time::Time;
+use crate::engine::yaml::nearest;
 
 use super::{Context, DeviceState, Presence, Target};
+use crate::engine::bus::waiting::Waiting;
 
 /// The targets of which a retained command was seen.
 #[derive(Clone, Debug, Default)]
@@ -29,6 +31,19 @@ impl DeviceState {
         let device = &self.settings.device;
         let points = device.points.iter().filter(|point| point.write.is_some());
         points.map(|point| &*point.name).chain(device.things.iter().map(|thing| &*thing.name)).collect()
+    }
+
+    /// What can be read again.
+    pub(in crate::engine::bus) fn names_to_read(&self) -> Vec<&str> {
+        let device = &self.settings.device;
+        let points = device.points.iter().filter(|point| !point.is_button());
+        points.map(|point| &*point.name).chain(device.things.iter().map(|thing| &*thing.name)).collect()
+    }
+
+    /// That there is no such point, and which of `names` may be meant.
+    pub(in crate::engine::bus) fn no_point(&self, found: &str, names: &[&str]) -> String {
+        let meant = nearest(found, names).map(|name| format!("; did you mean `{name}`?"));
+        format!("`{}` has no point `{found}`{}", self.name(), meant.unwrap_or_default())
     }
 
     pub(in crate::engine::bus) fn name_of(&self, target: Target) -> &str {
@@ -66,7 +81,7 @@ impl DeviceState {
         if codec::lives(self.device(), &thing.when, self.known()) != Ok(true) {
             return Err(format!("`{}` does not exist in the present mode of the device", thing.name));
         }
-        match thing.command(wanted) {
+        match thing.command(wanted.trim()) {
             Some(command) => Ok(command.orders.clone()),
             None => {
                 let known: Vec<String> =
@@ -74,6 +89,22 @@ impl DeviceState {
                 Err(format!("`{wanted}` is none of {}", known.join(", ")))
             }
         }
+    }
+
+    /// Whether `wanted` is something that the target can be told, as far as it is known now.
+    pub(in crate::engine::bus) fn is_valid(&self, target: Target, wanted: &str) -> bool {
+        match target {
+            Target::Point(point) | Target::Setting(point) => self.obeyed(point, wanted).is_some(),
+            Target::Thing(thing) => self.orders(thing, wanted).is_ok(),
+        }
+    }
+
+    /// What of a point is written for a command, and with which meaning of it.
+    fn obeyed(&self, point: PointIndex, wanted: &str) -> Option<(codec::Resolved<'_>, Vec<u16>)> {
+        let details = self.details(point);
+        let resolved = codec::resolve(self.device(), point, self.known()).ok()?;
+        let obeyed = codec::obey(details, details.write.as_ref()?, &resolved, wanted).ok()?;
+        Some((resolved, obeyed.words))
     }
 
     /// Whether a command can begin: the device is there, is the right one, what decides about the points
@@ -93,14 +124,8 @@ impl DeviceState {
     /// Whether the point's last reading is what is wanted: to find it so again wears out nothing.
     fn seems_to_hold(&self, target: Target, wanted: &str) -> bool {
         let Target::Point(point) = target else { return false };
-        let (details, Ok(resolved)) =
-            (self.details(point), codec::resolve(self.device(), point, self.known()))
-        else {
-            return false;
-        };
-        let Some(write) = &details.write else { return false };
-        let obeyed = codec::obey(details, write, &resolved, wanted);
-        obeyed.is_ok_and(|obeyed| codec::read(&resolved, &obeyed.words) == *self.values.reading(point))
+        let obeyed = self.obeyed(point, wanted);
+        obeyed.is_some_and(|(resolved, words)| codec::read(&resolved, &words) == *self.values.reading(point))
     }
 
     fn unknown_selector(&self, target: Target) -> Option<PointIndex> {
@@ -136,6 +161,16 @@ impl DeviceState {
         })
     }
 
+    /// Why a command that waits for its EEPROM's sake waits in vain: its time will have passed before the budget
+    /// allows another write.
+    pub(in crate::engine::bus) fn is_in_vain(&self, now: Time, waiting: &Waiting) -> Option<String> {
+        let is_point = matches!(waiting.target, Target::Point(_));
+        if !is_point || !self.spares_eeprom(now, waiting.target, &waiting.wanted.text) {
+            return None;
+        }
+        self.wear.spent_until(now, waiting.deadline_from(self.writable_at(waiting.target)))
+    }
+
     /// Why the point may not be written now, although its own time has come.
     pub(in crate::engine::bus) fn is_spent(&self, now: Time, point: PointIndex) -> Option<String> {
         if self.details(point).persistent { self.wear.spent(now) } else { None }
@@ -146,7 +181,12 @@ impl DeviceState {
         match &self.presence {
             Presence::Absent { reason } | Presence::Mismatch { reason } => reason.clone(),
             Presence::Present => match self.unknown_selector(target) {
-                Some(selector) => format!("waiting for {}", self.details(selector).name),
+                Some(selector) => {
+                    format!(
+                        "`{}`, which decides what it means, was not read in time",
+                        self.details(selector).name
+                    )
+                }
                 None if self.patience.failures() > 0 => "the device does not answer".to_string(),
                 None => "the bus had no time for it".to_string(),
             },

@@ -51,13 +51,23 @@ impl Wear {
         self.account.left = Wear::full(self.rules).saturating_sub(u64::from(writes_spent) * WRITE);
     }
 
+    /// Goes on by other rules. What was written stays written.
+    pub(super) fn change_rules(&mut self, now: Time, rules: Eeprom) {
+        let before = std::mem::replace(&mut self.rules, rules);
+        let (full, other) = (Wear::full(before), Wear::full(rules));
+        for account in self.writing.iter_mut().map(|(account, _)| account).chain([&mut self.account]) {
+            let spent = full - account.left(before, now);
+            (account.left, account.left_at) = (other.saturating_sub(spent), now);
+        }
+    }
+
     /// The point is being written, perhaps with others.
     pub(super) fn spend(&mut self, now: Time, point: PointIndex) {
         match &mut self.writing {
             Some((_, points)) => *points += 1,
             none => *none = Some((self.account.clone(), 1)),
         }
-        let left = self.left(now).saturating_sub(WRITE);
+        let left = self.account.left(self.rules, now).saturating_sub(WRITE);
         self.account.written_at.insert(point, now);
         (self.account.left, self.account.left_at) = (left, now);
     }
@@ -98,15 +108,25 @@ impl Wear {
         })
     }
 
-    /// How many writes have been taken out of the budget, and have not come in again.
-    pub(super) fn writes_spent(&self, now: Time) -> u32 {
-        (Wear::full(self.rules) - self.left(now)).div_ceil(WRITE) as u32
+    /// Why nothing will be written until `then`, as far as that can be known: a write that is under way may turn out
+    /// to be none.
+    pub(super) fn spent_until(&self, now: Time, then: Time) -> Option<String> {
+        let is_known = self.writing.is_none() && self.budget_at() > then;
+        if is_known { self.spent(now) } else { None }
     }
 
-    fn left(&self, now: Time) -> u64 {
-        let passed = now.since(self.account.left_at).as_micros() as u64;
-        let refilled = passed.saturating_mul(u64::from(self.rules.daily));
-        self.account.left.saturating_add(refilled).min(Wear::full(self.rules))
+    /// How many writes have been taken out of the budget, and have not come in again.
+    pub(super) fn writes_spent(&self, now: Time) -> u32 {
+        (Wear::full(self.rules) - self.account.left(self.rules, now)).div_ceil(WRITE) as u32
+    }
+}
+
+impl Account {
+    /// What is left of the budget now.
+    fn left(&self, rules: Eeprom, now: Time) -> u64 {
+        let passed = now.since(self.left_at).as_micros() as u64;
+        let refilled = passed.saturating_mul(u64::from(rules.daily));
+        self.left.saturating_add(refilled).min(Wear::full(rules))
     }
 }
 
@@ -171,6 +191,44 @@ mod tests {
             writes
         };
         assert_eq!([8, 500, 20, 4].map(writes_at_once), [0, 246, 6, 0]);
+    }
+
+    #[test]
+    fn rules_that_change_on_the_way_leave_what_was_written() {
+        let at = |seconds: u64| Time::from_millis(seconds * 1000);
+        let mut wear = Wear::new(Eeprom { daily: 8, ..RULES });
+        for point in 0..4 {
+            wear.spend(at(0), point);
+            assert_eq!(wear.end(true), 1);
+        }
+        // A quarter of a day brings a quarter of the day's second half.
+        let now = at(6 * 3600);
+        wear.change_rules(now, Eeprom { interval: Duration::from_secs(7 * 3600), daily: 500 });
+        assert_eq!((wear.writes_spent(now), wear.allowed_at(1)), (3, at(7 * 3600)));
+        // Again and again: nothing is lost by it, and nothing gained.
+        for _ in 0..9 {
+            wear.change_rules(now, Eeprom { daily: 8, ..RULES });
+            assert_eq!((wear.writes_spent(now), wear.spent(now)), (3, None));
+            wear.change_rules(now, RULES);
+        }
+        // One that is under way may still be none.
+        wear.spend(now, 9);
+        wear.change_rules(now, Eeprom { daily: 8, ..RULES });
+        assert_eq!((wear.writes_spent(now), wear.end(false)), (4, 0));
+        assert_eq!((wear.writes_spent(now), wear.allowed_at(9)), (3, Time::default()));
+    }
+
+    #[test]
+    fn that_nothing_is_left_is_known_before_as_far_as_it_can_be_known() {
+        let mut wear = Wear::new(Eeprom { daily: 2, ..RULES });
+        let now = Time::default();
+        wear.spend(now, 1);
+        let full = wear.budget_at();
+        assert_eq!(wear.spent_until(now, now), None, "the device may be too busy for it");
+        wear.end(true);
+        assert_eq!(full, now + Duration::from_secs(24 * 3600));
+        assert_eq!(wear.spent_until(now, full), None);
+        assert_eq!(wear.spent_until(now, Time(full.0 - 1)), wear.spent(now));
     }
 
     #[test]

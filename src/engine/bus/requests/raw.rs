@@ -5,7 +5,7 @@ use serde_json::json;
 use crate::engine::address::{Span, Table};
 use crate::engine::bus::Context;
 use crate::engine::bus::device::DeviceState;
-use crate::engine::command::words_of;
+use crate::engine::command::{ACCEPTED, ACKNOWLEDGE, BUSY_MAX, PAUSE_BUSY, words_of};
 use crate::engine::device::{PointIndex, WriteFunction};
 use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
 use crate::engine::request::Status;
@@ -52,6 +52,8 @@ pub(super) struct RawWrite {
     call: Call,
     settle: Duration,
     state: State,
+    /// How often the device was too busy for it.
+    busy: u32,
 }
 
 enum State {
@@ -61,6 +63,9 @@ enum State {
     ReadingBack(Option<RequestError>),
 }
 
+/// The device is still doing what it has been told.
+const ACCEPTED_ONLY: RequestError = RequestError::Exception(ACKNOWLEDGE);
+
 impl RawWrite {
     pub(super) fn new(span: Span, words: Vec<u16>, device: &DeviceState) -> Result<RawWrite, String> {
         let points = device.points_touching(span);
@@ -68,7 +73,7 @@ impl RawWrite {
         let only = writes().find_map(|write| write.with);
         let call = call(span, &words, only)?;
         let settle = writes().map(|write| write.settle).max().unwrap_or_default();
-        Ok(RawWrite { span, words, points, call, settle, state: State::Writing })
+        Ok(RawWrite { span, words, points, call, settle, state: State::Writing, busy: 0 })
     }
 
     pub(super) fn points(&self) -> &[PointIndex] {
@@ -90,6 +95,10 @@ impl RawWrite {
         result: Result<Answer, RequestError>,
         context: &mut Context,
     ) -> Progress {
+        if let Some(call) = self.busy_with(&result) {
+            self.busy += 1;
+            return Progress::Settle(PAUSE_BUSY, call);
+        }
         match &self.state {
             State::ReadingBefore => match result {
                 Ok(answer) => {
@@ -113,6 +122,7 @@ impl RawWrite {
                     Err(RequestError::Exception(3)) if device.clamps_with_exception() => {
                         Some(RequestError::Exception(3))
                     }
+                    Err(ACCEPTED_ONLY) => Some(ACCEPTED_ONLY),
                     Err(RequestError::Exception(code)) => return self.refused(code),
                     Err(RequestError::Impossible(reason)) => {
                         return self.ended("refused", None, Some(reason.into()));
@@ -120,9 +130,11 @@ impl RawWrite {
                     // Never repeated: what the device holds now decides.
                     Err(error) => Some(error),
                 };
+                let is_doing_it = doubt == Some(ACCEPTED_ONLY);
+                let settle = if is_doing_it { self.settle.max(PAUSE_BUSY) } else { self.settle };
                 self.state = State::ReadingBack(doubt);
                 let call = Call::Read(self.span);
-                if self.settle.is_zero() { Progress::Ask(call) } else { Progress::Settle(self.settle, call) }
+                if settle.is_zero() { Progress::Ask(call) } else { Progress::Settle(settle, call) }
             }
             State::ReadingBack(doubt) => match result {
                 Ok(answer) => {
@@ -131,7 +143,12 @@ impl RawWrite {
                     if found == self.words {
                         return self.ended("done", Some(&found), None);
                     }
+                    if *doubt == Some(ACCEPTED_ONLY) && self.busy < BUSY_MAX {
+                        self.busy += 1;
+                        return Progress::Settle(PAUSE_BUSY, Call::Read(self.span));
+                    }
                     let reason = match doubt {
+                        Some(ACCEPTED_ONLY) => format!("{ACCEPTED}, but holds something else still"),
                         Some(RequestError::Exception(_)) => "the device limits the value".into(),
                         Some(error) => error.to_string(),
                         None => "the device holds another value".into(),
@@ -140,6 +157,7 @@ impl RawWrite {
                 }
                 Err(error) => {
                     let reason = match doubt {
+                        Some(ACCEPTED_ONLY) => format!("{ACCEPTED}, but it was not read back: {error}"),
                         Some(of_write) => of_write.to_string(),
                         None => format!("written, but not read back: {error}"),
                     };
@@ -147,6 +165,18 @@ impl RawWrite {
                 }
             },
         }
+    }
+
+    /// What is asked again because the device had no time for it: as of commands, nothing that it has said it does.
+    fn busy_with(&self, result: &Result<Answer, RequestError>) -> Option<Call> {
+        let is_writing = matches!(self.state, State::Writing);
+        let is_busy = match result {
+            Err(RequestError::Exception(6)) => true,
+            Err(ACCEPTED_ONLY) => !is_writing,
+            _ => false,
+        };
+        let call = if is_writing { self.call.clone() } else { Call::Read(self.span) };
+        (is_busy && self.busy < BUSY_MAX).then_some(call)
     }
 
     /// Why it has not ended well, when nothing more can be asked.
