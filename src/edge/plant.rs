@@ -9,7 +9,7 @@ use crate::edge::mqtt::{BrokerState, Mailbox, News};
 use crate::edge::stir::Stir;
 use crate::engine::bus::{Command, Event, Full, REPLACED};
 use crate::engine::command::{Outcome, OutcomeKind, Wish};
-use crate::engine::health::{BrokerReport, GatewayReport};
+use crate::engine::health::BrokerReport;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::request::{Decision, Desk};
@@ -95,6 +95,10 @@ impl Plant {
         self.parts().connection = Some(connection);
     }
 
+    pub fn clock(&self) -> Clock {
+        self.clock
+    }
+
     /// Who changes how the gateway is stirs this.
     pub fn stir(&self) -> &Arc<Stir> {
         &self.stir
@@ -119,12 +123,6 @@ impl Plant {
     pub fn broker(&self) -> BrokerReport {
         let connection = self.parts().connection.clone();
         connection.map(|connection| connection.report()).unwrap_or_default()
-    }
-
-    /// `bridge/info` as it is with this report.
-    pub fn info(&self, report: &GatewayReport) -> Message {
-        let parts = self.parts();
-        Message::retained(parts.topics.bridge_info(), report.info_json(&parts.settings).to_string())
     }
 
     fn parts(&self) -> MutexGuard<'_, Parts> {

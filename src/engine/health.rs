@@ -1,10 +1,12 @@
 //! What a bus and its devices say of themselves: counters, states and reasons.
 
+mod bulletin;
 mod json;
 mod readout;
 mod spread;
 
-pub use json::{device_json, drift_json, info_json, point_json, seconds};
+pub use bulletin::{Bulletin, info};
+pub use json::{device_json, drift_json, point_json, seconds};
 pub use readout::{Readout, ReadoutValue};
 pub use spread::{Percentiles, Spread, SpreadReport, Timing, TimingReport};
 
@@ -387,6 +389,11 @@ impl GatewayReport {
         }
     }
 
+    /// Whether every bus has answered for itself.
+    pub fn all_respond(&self) -> bool {
+        self.buses.iter().all(|bus| bus.responding)
+    }
+
     /// Every device with its bus.
     pub fn devices(&self) -> impl Iterator<Item = (&BusReport, &DeviceReport)> {
         self.buses.iter().flat_map(|bus| bus.report.devices.iter().map(|device| (&bus.report, device)))
@@ -430,7 +437,7 @@ mod tests {
         }
     }
 
-    fn gateway(connected: bool, up: bool, responding: bool, online: &[bool]) -> GatewayReport {
+    pub(super) fn gateway(connected: bool, up: bool, responding: bool, online: &[bool]) -> GatewayReport {
         let devices = online.iter().enumerate().map(|(index, online)| device(&format!("d{index}"), *online));
         let report = BusReport {
             name: "cellar".into(),

@@ -115,7 +115,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 state.reason = Some(reason);
                 drop(state);
                 self.connected = false;
-                self.mailbox.outbox().listens_no_more();
+                self.mailbox.outbox().disconnected();
                 if self.told_up != Some(false) {
                     self.told_up = Some(false);
                     (self.tell)(News::Down);

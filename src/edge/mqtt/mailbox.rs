@@ -5,6 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::Notify;
 
 use crate::engine::outbox::Outbox;
+use crate::engine::time::Time;
 use crate::engine::topics::Message;
 
 /// Where everybody puts messages for the broker, whether it is there or not.
@@ -25,9 +26,15 @@ impl Mailbox {
     }
 
     /// Does something with all that waits or is remembered.
-    pub fn change(&self, change: impl FnOnce(&mut Outbox)) {
-        change(&mut self.outbox());
+    pub fn change<T>(&self, change: impl FnOnce(&mut Outbox) -> T) -> T {
+        let result = change(&mut self.outbox());
         self.news.notify_one();
+        result
+    }
+
+    /// Whether less is worth remembering than before: [`Outbox::settle`].
+    pub fn settle(&self, now: Time) -> bool {
+        self.outbox().settle(now)
     }
 
     /// Looks at what waits or is remembered.

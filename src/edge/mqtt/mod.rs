@@ -77,6 +77,7 @@ impl Broker {
         let topics = Topics::of(&settings.mqtt);
         let options = options(&settings.mqtt, &topics, secrets);
         let client_id = options.client_id();
+        mailbox.change(Outbox::disconnected);
         let (client, event_loop) = AsyncClient::new(options, IN_FLIGHT);
         let state = Arc::new(Mutex::new(BrokerReport::default()));
         let connection = Arc::new(Mutex::new(Connection::default()));
