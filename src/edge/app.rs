@@ -20,7 +20,7 @@ use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
 use crate::engine::health::{self, Bulletin, GatewayReport};
-use crate::engine::homeassistant::{self, Gateway};
+use crate::engine::homeassistant;
 use crate::engine::profile::Library;
 use crate::engine::reload;
 use crate::engine::settings::Settings;
@@ -160,13 +160,7 @@ fn store_what_is_told(plant: &Plant, state: &StateFiles, now: Time) {
 /// What is known of the gateway before anything has happened.
 pub(super) fn introduce(settings: &Settings, mailbox: &Mailbox) {
     mailbox.push(health::info(settings));
-    if settings.home_assistant.discovery {
-        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
-        mailbox.push(homeassistant::announce_bridge(&gateway).message());
-        for bus in &settings.buses {
-            mailbox.push(homeassistant::announce_bus(&gateway, &bus.name).message());
-        }
-    }
+    homeassistant::introduction(settings).into_iter().for_each(|message| mailbox.push(message));
 }
 
 /// Starts the buses of these numbers of the plant's settings. An error means that none of them runs.

@@ -11,12 +11,11 @@ use crate::edge::app::{
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
-use crate::edge::plant::identities;
 use crate::edge::reports::Reporter;
 use crate::edge::secrets::Secrets;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::Event;
-use crate::engine::homeassistant::{self, Gateway};
+use crate::engine::homeassistant;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::reload::{self, Change, Fate, Parts};
@@ -172,9 +171,8 @@ impl App {
                 }
                 _ => {
                     let mailbox = self.plant.mailbox();
-                    if settings.home_assistant.discovery {
-                        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
-                        mailbox.push(homeassistant::announce_bus(&gateway, name).message());
+                    if let Some(message) = homeassistant::introduction_of_bus(&settings, name) {
+                        mailbox.push(message);
                     }
                     let bus = start_bus(
                         &self.threads,
@@ -243,7 +241,7 @@ impl App {
         let (before, wanted) = (reload::topics_of_devices(old), reload::topics_of_devices(new));
         let changed = reload::changed_devices(old, new);
         self.plant.mailbox().change(|outbox| {
-            outbox.reconfigure(identities(new, &topics), &before, &wanted);
+            outbox.reconfigure(homeassistant::identities(new), &before, &wanted);
             for device in changed {
                 outbox.announced_anew(&topics.identity(&device));
             }

@@ -19,12 +19,13 @@ pub use self::mailbox::Mailbox;
 use self::poller::Poller;
 use crate::edge::clock::Clock;
 use crate::edge::secrets::Secrets;
+use crate::engine::arrivals::Arrivals;
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::outbox::Outbox;
 use crate::engine::settings::{Mqtt, Settings};
 use crate::engine::time::Duration;
-use crate::engine::topics::{self, OFFLINE, Topics};
+use crate::engine::topics::{OFFLINE, Topics};
 
 /// Requests that the library may hold; the others wait in the outbox, where a newer value replaces an
 /// older one.
@@ -97,21 +98,11 @@ impl Broker {
         };
         let poller = tokio::spawn(poller.run());
         let (goodbye, goodbye_heard) = oneshot::channel();
-        let mut filters = topics.subscriptions();
-        let former_states = mailbox.look(Outbox::former_states);
-        filters.extend(former_states.iter().cloned());
-        if settings.home_assistant.discovery {
-            filters.push(settings.home_assistant.status_topic.clone());
-        }
-        // What an earlier run announced, to take away what is gone; all of it without discovery.
-        filters.push(topics::discovery(&settings.home_assistant.prefix, "+"));
         let feeder = Feeder {
             client,
             clock,
             topics,
-            status_topic: settings.home_assistant.status_topic.clone(),
-            filters,
-            former_states,
+            arrivals: Arrivals::new(settings, mailbox.look(Outbox::former_states)),
             mailbox: mailbox.clone(),
             state: state.clone(),
             connected: false,
