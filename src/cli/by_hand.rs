@@ -19,7 +19,7 @@ use crate::engine::modbus::{Answer, Call, Request, RequestError};
 use crate::engine::profile::Library;
 use crate::engine::settings::{self, Rs485};
 use crate::engine::time::Duration;
-use crate::engine::yaml::{Scalar, nearest};
+use crate::engine::yaml::Scalar;
 
 /// Where the device is: for a verb's own arguments by `#[command(flatten)]`.
 #[derive(Debug, clap::Args)]
@@ -125,11 +125,7 @@ fn profile(id: &str) -> Result<Device, Failure> {
         return library.check(id, &bytes.map_err(Failure::WrongInput)?).map_err(configuration::faults);
     }
     if !library.contains(id) {
-        let remedy = match nearest(id, &library.ids()) {
-            Some(meant) => format!("did you mean `{meant}`?"),
-            None => "`busker profiles list` lists them".into(),
-        };
-        return Err(Failure::wrong(format!("unknown profile `{id}`; {remedy}")));
+        return Err(Failure::wrong(library.unknown(id)));
     }
     library.load(id).map_err(configuration::faults)
 }
@@ -239,19 +235,20 @@ impl Asked {
         Ok(words_of(&answer))
     }
 
-    /// Which point is called `name`.
-    pub fn point(&self, name: &str) -> Result<PointIndex, Failure> {
+    /// The point that is called `name`, and the device that knows it.
+    pub fn point(&self, name: &str) -> Result<(Device, PointIndex), Failure> {
         let Some(device) = &self.device else {
             return Err(Failure::wrong(format!(
                 "`{name}` is no address; expected one like `holding 0..3`, or a point's name with --config and --device, or with --profile"
             )));
         };
-        device.points.iter().position(|point| point.name == name).ok_or_else(|| {
-            Failure::wrong(format!(
+        match device.points.iter().position(|point| point.name == name) {
+            Some(index) => Ok((device.clone(), index)),
+            None => Err(Failure::wrong(format!(
                 "`{name}` is no point of {} and no address like `holding 0..3`; `busker profiles show {0}` lists the points",
                 device.profile
-            ))
-        })
+            ))),
+        }
     }
 
     /// Reads what decides how `point` is understood, and what decides that.

@@ -104,8 +104,7 @@ fn write_words(device: &mut Asked, span: Span, words: &[u16], call: &Call) -> Re
 }
 
 fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
-    let index = asked.point(&args.place)?;
-    let Some(device) = asked.device.clone() else { return Ok(()) };
+    let (device, index) = asked.point(&args.place)?;
     let [wanted] = &args.values[..] else {
         return Err(Failure::wrong("a point takes one value"));
     };

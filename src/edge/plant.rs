@@ -1,9 +1,10 @@
 //! What runs now, for everybody who has to reach it: a new configuration exchanges it under them.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::clock::Clock;
+use crate::edge::lock::lock;
 use crate::edge::mqtt::{BrokerState, Mailbox, News};
 use crate::edge::stir::Stir;
 use crate::engine::bus::{Command, Event, Full, REPLACED};
@@ -111,8 +112,7 @@ impl Plant {
     }
 
     fn parts(&self) -> MutexGuard<'_, Parts> {
-        // The parts are whole after every call, whoever panicked meanwhile.
-        self.parts.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.parts)
     }
 
     /// Brings what the broker tells to the buses that it concerns.

@@ -4,9 +4,10 @@ use std::fs::{self, DirEntry, File, OpenOptions};
 use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 use crate::edge::clock::Clock;
+use crate::edge::lock::lock;
 use crate::engine::bus::Saved;
 use crate::engine::recorder::Recording;
 use crate::engine::recorder::files::{self, Kept};
@@ -20,7 +21,7 @@ static SAVING: Mutex<()> = Mutex::new(());
 /// Makes a file of the recording in `folder`. The bus keeps not more than `keep` of them.
 pub fn save(folder: &Path, recording: &Recording, clock: Clock, keep: usize) -> Result<Saved, String> {
     let cannot = |error: io::Error| format!("`{}` cannot be written: {error}", folder.display());
-    let _alone = SAVING.lock().unwrap_or_else(PoisonError::into_inner);
+    let _alone = lock(&SAVING);
     fs::create_dir_all(folder).map_err(cannot)?;
     let (bytes, frames) = recording.to_pcapng(clock.since_1970_at(recording.made_at));
     let others = kept(folder).map_err(cannot)?;

@@ -16,6 +16,7 @@ use rustix::fs::FlockOperation;
 use rustix::io::Errno;
 use serde::de::DeserializeOwned;
 
+use crate::edge::lock::lock;
 use crate::engine::memory::{Memories, Memory, Record};
 use crate::engine::outbox::Tree;
 use crate::engine::time::Duration;
@@ -233,7 +234,7 @@ impl StateFiles {
     pub fn finish(&self) {
         self.desk.lock().finish = true;
         self.desk.changed.notify_all();
-        let thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let thread = lock(&self.thread).take();
         if thread.is_some_and(|thread| thread.join().is_err()) {
             tracing::error!("the thread that stores the state ended in a panic");
         }
@@ -248,7 +249,7 @@ impl Drop for StateFiles {
 
 impl Desk {
     fn lock(&self) -> MutexGuard<'_, Waiting> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.waiting)
     }
 
     fn work(&self, folder: &Path) {
@@ -304,10 +305,6 @@ impl Desk {
             self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
         (std::mem::take(&mut waiting.memories), std::mem::take(&mut waiting.others), waiting.finish)
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn file_of(folder: &Path, device: &str) -> PathBuf {

@@ -123,9 +123,7 @@ fn news(event: &'static str, look: &Look, mut data: Value) -> News {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::health::{
-        BrokerReport, BusReport, Counters, PointReport, Role, ThingReport, good_for,
-    };
+    use crate::engine::health::{BrokerReport, BusReport, PointReport, Role, ThingReport, good_for};
     use crate::engine::time::Duration;
 
     /// A gateway with one device, whose two points were read at once, half a second ago.
@@ -162,25 +160,14 @@ mod tests {
         };
         let report = BusReport {
             name: "cellar".into(),
-            link: "tcp".into(),
-            line: None,
             up: true,
-            reason: None,
-            paused: false,
-            counters: Counters::default(),
             load: 0.1,
-            timing: Default::default(),
             devices: vec![device],
+            ..BusReport::default()
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
-        Look {
-            at,
-            report: GatewayReport {
-                broker,
-                buses: vec![BusHealth { report, responding: true }],
-                configuration_error: None,
-            },
-        }
+        let buses = vec![BusHealth { report, responding: true }];
+        Look { at, report: GatewayReport { broker, buses, configuration_error: None } }
     }
 
     fn device(look: &mut Look) -> &mut DeviceReport {

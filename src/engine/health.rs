@@ -103,7 +103,7 @@ impl Counters {
 }
 
 /// A bus as it is now.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct BusReport {
     pub name: String,
     /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`
@@ -441,15 +441,10 @@ mod tests {
         let devices = online.iter().enumerate().map(|(index, online)| device(&format!("d{index}"), *online));
         let report = BusReport {
             name: "cellar".into(),
-            link: "tcp 127.0.0.1:502".into(),
-            line: None,
             up,
-            reason: None,
-            paused: false,
-            counters: Counters::default(),
             load: 0.123_456,
-            timing: TimingReport::default(),
             devices: devices.collect(),
+            ..BusReport::default()
         };
         let broker = BrokerReport { connected, ..BrokerReport::default() };
         GatewayReport { broker, buses: vec![BusHealth { report, responding }], configuration_error: None }
@@ -487,6 +482,7 @@ mod tests {
         assert_eq!(device["points"][0]["value"], "21.5");
         assert_eq!(device["points"][0]["read_seconds_ago"], 0.5);
     }
+
     #[test]
     fn only_what_was_read_in_time_on_a_bus_that_is_heard_is_fresh() {
         let missing = Some(("offline", "the device is offline".to_string()));

@@ -5,7 +5,7 @@
 
 use std::convert::Infallible;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
 
 use bytes::Bytes;
@@ -15,6 +15,7 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::edge::clock::Clock;
+use crate::edge::lock::lock;
 use crate::edge::reports::{Detail, Reporter};
 use crate::engine::feed::{self, Look, News};
 use crate::engine::time::{Duration, Time};
@@ -50,13 +51,13 @@ impl Hub {
     pub fn join(&self) -> Option<EventStream> {
         let seat = self.seats.clone().try_acquire_owned().ok()?;
         let (sender, news) = channel(WAITING_MAX);
-        self.arrived.lock().unwrap_or_else(PoisonError::into_inner).push(sender);
+        lock(&self.arrived).push(sender);
         self.bell.notify_one();
         Some(EventStream { news, _seat: seat })
     }
 
     fn take_arrived(&self) -> Vec<Sender<Bytes>> {
-        std::mem::take(&mut *self.arrived.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut *lock(&self.arrived))
     }
 }
 

@@ -1,9 +1,10 @@
 //! What waits for the broker, where every thread can reach it.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 use tokio::sync::Notify;
 
+use crate::edge::lock::lock;
 use crate::engine::outbox::Outbox;
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
@@ -43,7 +44,6 @@ impl Mailbox {
     }
 
     pub(super) fn outbox(&self) -> MutexGuard<'_, Outbox> {
-        // The outbox is whole after every call, whoever panicked meanwhile.
-        self.outbox.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.outbox)
     }
 }

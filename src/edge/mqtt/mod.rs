@@ -6,7 +6,7 @@ mod losses;
 mod mailbox;
 mod poller;
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use rumqttc::{AsyncClient, LastWill, MqttOptions, QoS};
 use tokio::sync::{mpsc, oneshot};
@@ -18,6 +18,7 @@ use self::losses::Ends;
 pub use self::mailbox::Mailbox;
 use self::poller::Poller;
 use crate::edge::clock::Clock;
+use crate::edge::lock::lock;
 use crate::edge::secrets::Secrets;
 use crate::engine::arrivals::Arrivals;
 use crate::engine::connection::Connection;
@@ -137,10 +138,6 @@ impl Broker {
             self.feeder.abort();
         }
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn options(mqtt: &Mqtt, topics: &Topics, secrets: Secrets) -> MqttOptions {

@@ -29,8 +29,8 @@ use crate::engine::settings::{
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
 use crate::engine::yaml::{
-    At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, nearest, parse,
-    read, schema_of,
+    At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, parse, read,
+    schema_of,
 };
 
 /// Something that works and may still be a mistake.
@@ -338,7 +338,7 @@ impl Resolver<'_> {
     fn identities(&mut self, name: &At<Name>, device: &Device, others: &[DeviceSettings]) {
         for other in others {
             let (own, others_own) = (name.0.as_str(), other.name.as_str());
-            let same = match (within(own, others_own), within(others_own, own)) {
+            let same = match (rest_behind(own, others_own), rest_behind(others_own, own)) {
                 (Some(rest), _) => shared_name(rest, device, &other.device),
                 (_, Some(rest)) => shared_name(rest, &other.device, device).map(|(a, b)| (b, a)),
                 _ => None,
@@ -425,11 +425,7 @@ impl Resolver<'_> {
 
     fn profile(&mut self, wanted: &At<String>) -> Option<Device> {
         if !self.library.contains(wanted) {
-            let remedy = match nearest(wanted, &self.library.ids()) {
-                Some(meant) => format!("did you mean `{meant}`?"),
-                None => "`busker profiles list` lists them".into(),
-            };
-            self.faults.add(&wanted.place, format!("unknown profile `{}`; {remedy}", wanted.value));
+            self.faults.add(&wanted.place, self.library.unknown(wanted));
             return None;
         }
         self.library.load(wanted).map_err(|faults| self.faults.extend(faults)).ok()
@@ -485,7 +481,7 @@ impl Resolver<'_> {
 }
 
 /// What stands in `long` behind `short` and a `_`.
-fn within<'n>(long: &'n str, short: &str) -> Option<&'n str> {
+fn rest_behind<'n>(long: &'n str, short: &str) -> Option<&'n str> {
     long.strip_prefix(short)?.strip_prefix('_')
 }
 
