@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, anyhow};
 
 use super::characters::Characters;
-use super::{Failure, configuration};
+use super::{Failure, configuration, profiles};
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::Link;
@@ -16,7 +16,6 @@ use crate::engine::device::{Device, PointIndex};
 use crate::engine::identity;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
-use crate::engine::profile::Library;
 use crate::engine::settings::{self, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::Scalar;
@@ -94,7 +93,7 @@ impl ByHand {
         if !matches!(link, settings::Link::Tcp { .. }) && unit > 247 {
             return Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")));
         }
-        let device = self.profile.as_deref().map(profile).transpose()?;
+        let device = self.profile.as_deref().map(profiles::load).transpose()?;
         let demanded = device.as_ref().and_then(|device| device.wire.response_timeout);
         open(&link, None, unit, demanded.unwrap_or_default().max(self.timeout), device)
     }
@@ -103,31 +102,11 @@ impl ByHand {
         let path = self.line.config.clone().unwrap_or_default();
         let settings = configuration::ConfigurationArgs { config: path }.load()?;
         let name = self.device.as_deref().unwrap_or_default();
-        let Some(device) = settings.devices.iter().find(|device| device.name == name) else {
-            let names: Vec<String> =
-                settings.devices.iter().map(|device| format!("`{}`", device.name)).collect();
-            return Err(Failure::wrong(format!(
-                "there is no device `{name}`; expected one of {}",
-                names.join(", ")
-            )));
-        };
+        let device = configuration::device_named(&settings, name)?;
         let bus = &settings.buses[device.bus];
         let timeout = device.device.wire.response_timeout.unwrap_or_default().max(bus.response_timeout);
         open(&bus.link, bus.gap, device.unit, timeout, Some(Device::clone(&device.device)))
     }
-}
-
-/// The device of a shipped profile, or of a file.
-fn profile(id: &str) -> Result<Device, Failure> {
-    let library = Library::shipped();
-    if id.ends_with(".yaml") {
-        let bytes = std::fs::read(id).with_context(|| format!("cannot read the profile `{id}`"));
-        return library.check(id, &bytes.map_err(Failure::WrongInput)?).map_err(configuration::faults);
-    }
-    if !library.contains(id) {
-        return Err(Failure::wrong(library.unknown(id)));
-    }
-    library.load(id).map_err(configuration::faults)
 }
 
 fn open(

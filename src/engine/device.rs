@@ -9,7 +9,7 @@ mod wire;
 mod write;
 
 pub use form::{Case, Decimals, Encoding, Form, Kind, Names, Order, Unit};
-pub use presentation::{Category, Platform, Presentation};
+pub use presentation::{Category, Platform, Presentation, sentence};
 pub use thing::{PRESS, State, Thing, ThingCommand, ThingKind};
 pub use wire::{Forbidden, Intervals, Limits, Quirks, Wire};
 pub use write::{OutOfRange, Write, WriteFunction, WriteRule};

@@ -293,7 +293,7 @@ impl Resolver<'_> {
                 self.identities(name, &resolved, &devices);
                 devices.push(DeviceSettings {
                     name: name.0.clone(),
-                    title: device.name.clone().unwrap_or_else(|| title(&name.0)),
+                    title: device.name.clone().unwrap_or_else(|| device::sentence(&name.0)),
                     bus,
                     unit: unit.value.0,
                     device: shared(resolved, &mut distinct),
@@ -534,13 +534,6 @@ fn section<T: Read + Clone>(file: &Option<Part<T>>) -> Option<T> {
             read(&empty, &mut Faults::default())
         }
     }
-}
-
-/// `heating_relays` → `Heating relays`.
-fn title(name: &str) -> String {
-    let mut letters = name.chars();
-    let first = letters.next().map(|first| first.to_ascii_uppercase());
-    first.into_iter().chain(letters).map(|c| if c == '_' { ' ' } else { c }).collect()
 }
 
 /// A duration as people write it here: `250ms`, `1.5s`, `10m`.

@@ -190,6 +190,17 @@ impl Order {
     pub const fn swaps_bytes(self) -> bool {
         matches!(self, Order::Badc | Order::Dcba)
     }
+
+    /// One value's words, the most significant first, to this order; and from it back again.
+    pub fn turn(self, mut words: Vec<u16>) -> Vec<u16> {
+        if self.low_word_first() {
+            words.reverse();
+        }
+        if self.swaps_bytes() {
+            words.iter_mut().for_each(|word| *word = word.swap_bytes());
+        }
+        words
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -23,8 +23,7 @@ pub use entity::Entity;
 #[cfg(test)]
 use gateway::{announce_bridge, announce_bus};
 pub use gateway::{identities, introduction, introduction_of_bus};
-pub use point::{entity, is_settled, sentence};
-pub use thing::name_of_thing;
+pub use point::{entity, is_settled};
 
 #[cfg(test)]
 mod tests;

@@ -120,7 +120,7 @@ fn can_say(point: &Point, text: &str) -> Result<(), String> {
 fn can_be_told(point: &Point, text: &str) -> Result<(), String> {
     match point.write.as_ref().map(|write| &write.rule) {
         None => Err("is never written; expected a point with `write`".into()),
-        Some(WriteRule::Press { .. }) if text == "PRESS" => Ok(()),
+        Some(WriteRule::Press { .. }) if text == WriteRule::PRESS => Ok(()),
         Some(WriteRule::Press { .. }) => Err("is a button; expected `PRESS`".into()),
         Some(WriteRule::Names(allowed)) if !allowed.iter().any(|name| name == text) => {
             Err(format!("may not be set to `{text}`; expected one of its `write`"))
