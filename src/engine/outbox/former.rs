@@ -14,7 +14,7 @@ use crate::engine::topics::{Message, ONLINE, Topics};
 const LISTEN_FOR: Duration = Duration::from_secs(2);
 
 /// The retained topics of a gateway's devices below one base topic; kept in `state_dir`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Tree {
     pub base_topic: String,
     pub topics: BTreeSet<String>,
