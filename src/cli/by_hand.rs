@@ -221,7 +221,7 @@ impl Asked {
                 "`{name}` is no address; expected one like `holding 0..3`, or a point's name with --config and --device, or with --profile"
             )));
         };
-        match device.points.iter().position(|point| point.name == name) {
+        match device.point_named(name) {
             Some(index) => Ok((device.clone(), index)),
             None => Err(Failure::wrong(format!(
                 "`{name}` is no point of {} and no address like `holding 0..3`; `busker profiles show {0}` lists the points",

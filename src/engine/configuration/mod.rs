@@ -446,7 +446,7 @@ impl Resolver<'_> {
         for point in &device.points {
             let unit = points.0.get(&point.name).and_then(|point| point.get("unit"));
             let place = unit.map_or(points.0.named_at(), |unit| &unit.place);
-            for form in wishes::forms(point) {
+            for form in point.encoding.forms() {
                 if let device::Unit::Fixed(unit) = &form.unit {
                     wishes::hint_at_unit(&point.name, unit, place, &mut self.warnings);
                 }
