@@ -6,10 +6,11 @@ use std::net::{TcpListener, TcpStream};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use anyhow::{Context, anyhow};
 use busker::edge::clock::Clock;
+use busker::edge::lock::lock;
 use busker::engine::time::{Duration, Time};
 use busker::simulator::device::{Addressed, Place, SimulatedDevice, Stimulus};
 use busker::simulator::line::{Line, Transmission};
@@ -250,7 +251,7 @@ impl Shared {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     fn next_generation(&self) -> u64 {
@@ -350,10 +351,6 @@ fn replace_link(target: &Path, link: &Path) -> anyhow::Result<()> {
     let new = link.with_extension("new");
     std::os::unix::fs::symlink(target, &new).context("a link in a temporary folder")?;
     Ok(std::fs::rename(new, link)?)
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl SimulatedDevice for Overheard {

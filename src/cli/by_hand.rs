@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, anyhow};
 
 use super::characters::Characters;
-use super::{Failure, configuration};
+use super::{Failure, configuration, profiles};
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::Link;
@@ -16,10 +16,9 @@ use crate::engine::device::{Device, PointIndex};
 use crate::engine::identity;
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
-use crate::engine::profile::Library;
 use crate::engine::settings::{self, Rs485};
 use crate::engine::time::Duration;
-use crate::engine::yaml::{Scalar, nearest};
+use crate::engine::yaml::Scalar;
 
 /// Where the device is: for a verb's own arguments by `#[command(flatten)]`.
 #[derive(Debug, clap::Args)]
@@ -94,7 +93,7 @@ impl ByHand {
         if !matches!(link, settings::Link::Tcp { .. }) && unit > 247 {
             return Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")));
         }
-        let device = self.profile.as_deref().map(profile).transpose()?;
+        let device = self.profile.as_deref().map(profiles::load).transpose()?;
         let demanded = device.as_ref().and_then(|device| device.wire.response_timeout);
         open(&link, None, unit, demanded.unwrap_or_default().max(self.timeout), device)
     }
@@ -103,35 +102,11 @@ impl ByHand {
         let path = self.line.config.clone().unwrap_or_default();
         let settings = configuration::ConfigurationArgs { config: path }.load()?;
         let name = self.device.as_deref().unwrap_or_default();
-        let Some(device) = settings.devices.iter().find(|device| device.name == name) else {
-            let names: Vec<String> =
-                settings.devices.iter().map(|device| format!("`{}`", device.name)).collect();
-            return Err(Failure::wrong(format!(
-                "there is no device `{name}`; expected one of {}",
-                names.join(", ")
-            )));
-        };
+        let device = configuration::device_named(&settings, name)?;
         let bus = &settings.buses[device.bus];
         let timeout = device.device.wire.response_timeout.unwrap_or_default().max(bus.response_timeout);
         open(&bus.link, bus.gap, device.unit, timeout, Some(Device::clone(&device.device)))
     }
-}
-
-/// The device of a shipped profile, or of a file.
-fn profile(id: &str) -> Result<Device, Failure> {
-    let library = Library::shipped();
-    if id.ends_with(".yaml") {
-        let bytes = std::fs::read(id).with_context(|| format!("cannot read the profile `{id}`"));
-        return library.check(id, &bytes.map_err(Failure::WrongInput)?).map_err(configuration::faults);
-    }
-    if !library.contains(id) {
-        let remedy = match nearest(id, &library.ids()) {
-            Some(meant) => format!("did you mean `{meant}`?"),
-            None => "`busker profiles list` lists them".into(),
-        };
-        return Err(Failure::wrong(format!("unknown profile `{id}`; {remedy}")));
-    }
-    library.load(id).map_err(configuration::faults)
 }
 
 fn open(
@@ -239,19 +214,20 @@ impl Asked {
         Ok(words_of(&answer))
     }
 
-    /// Which point is called `name`.
-    pub fn point(&self, name: &str) -> Result<PointIndex, Failure> {
+    /// The point that is called `name`, and the device that knows it.
+    pub fn point(&self, name: &str) -> Result<(Device, PointIndex), Failure> {
         let Some(device) = &self.device else {
             return Err(Failure::wrong(format!(
                 "`{name}` is no address; expected one like `holding 0..3`, or a point's name with --config and --device, or with --profile"
             )));
         };
-        device.points.iter().position(|point| point.name == name).ok_or_else(|| {
-            Failure::wrong(format!(
+        match device.point_named(name) {
+            Some(index) => Ok((device.clone(), index)),
+            None => Err(Failure::wrong(format!(
                 "`{name}` is no point of {} and no address like `holding 0..3`; `busker profiles show {0}` lists the points",
                 device.profile
-            ))
-        })
+            ))),
+        }
     }
 
     /// Reads what decides how `point` is understood, and what decides that.

@@ -12,8 +12,8 @@ use crate::edge::link::adapter;
 use crate::edge::{files, tls};
 use crate::engine::configuration::{self, Warning};
 use crate::engine::profile::Library;
-use crate::engine::settings::{Link, Password, Settings};
-use crate::engine::yaml::Diagnostic;
+use crate::engine::settings::{DeviceSettings, Link, Password, Settings};
+use crate::engine::yaml::{Diagnostic, list_of_choices};
 
 /// `--config FILE`, for a verb's own arguments by `#[command(flatten)]`.
 #[derive(clap::Args, Debug)]
@@ -160,6 +160,14 @@ pub fn load(path: &Path) -> Result<Result<Loaded, Vec<Diagnostic>>, Failure> {
         Ok(_) => Ok(Err(unreadable)),
         Err(faults) => Ok(Err([unreadable, faults].concat())),
     }
+}
+
+/// The device of this name.
+pub fn device_named<'s>(settings: &'s Settings, name: &str) -> Result<&'s DeviceSettings, Failure> {
+    settings.devices.iter().find(|device| device.name == name).ok_or_else(|| {
+        let names: Vec<&str> = settings.devices.iter().map(|device| device.name.as_str()).collect();
+        Failure::wrong(format!("there is no device `{name}`; {}", list_of_choices(name, &names)))
+    })
 }
 
 /// Faults as a verb returns them.

@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use super::Failure;
 use super::characters::Characters;
 use super::configuration::ConfigurationArgs;
-use super::{Failure, output};
+use super::output::{self, counted};
 use crate::edge::clock::Clock;
 use crate::edge::link::check_up::{self, CheckUp, Opened};
 use crate::edge::link::{Link, Lost};
@@ -298,7 +299,7 @@ fn of_noise(heard: &[u8], time: Duration) -> Finding {
     let seconds = time.as_secs_f64();
     let others = sorted.requests_of_others;
     if others.count > 0 {
-        let requests = several(others.count, "request");
+        let requests = counted(others.count as usize, "request");
         let found = format!("{requests} of another master in {seconds} s, the last to unit {}", others.unit);
         return Finding::bad("noise", found, "a Modbus RTU line has one master; unplug the other");
     }
@@ -306,20 +307,16 @@ fn of_noise(heard: &[u8], time: Duration) -> Finding {
         (0, 0) => Finding::good("noise", format!("none in {seconds} s")),
         (0, bytes) => Finding::bad(
             "noise",
-            format!("{} in {seconds} s that belong to no frame", several(bytes, "byte")),
+            format!("{} in {seconds} s that belong to no frame", counted(bytes as usize, "byte")),
             "look at baud and parity, at the termination at both ends and the bias of the line, and for A and B \
              swapped",
         ),
         (frames, _) => Finding::bad(
             "noise",
-            format!("{} in {seconds} s, though nobody was asked", several(frames, "whole frame")),
+            format!("{} in {seconds} s, though nobody was asked", counted(frames as usize, "whole frame")),
             "another master speaks on this line, or a device speaks unasked",
         ),
     }
-}
-
-fn several(count: u32, what: &str) -> String {
-    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
 }
 
 /// What is heard after a request that nobody answers.
@@ -329,7 +326,7 @@ fn of_echo(request: &[u8], heard: &[u8]) -> Finding {
         (0, 0) => Finding::good("echo", "none: the line does not return what is sent"),
         (0, bytes) => Finding::bad(
             "echo",
-            format!("not what was sent came back, but {}", several(bytes as u32, "other byte")),
+            format!("not what was sent came back, but {}", counted(bytes, "other byte")),
             "another speaks at the same time, or the line is not terminated or biased as it should be",
         ),
         _ => Finding::good("echo", "the line returns what is sent; collisions will be noticed by that"),

@@ -1,16 +1,12 @@
 //! `busker plan`: what each device will be asked, as a table.
 
-use std::path::Path;
-
 use serde::Serialize;
 
-use super::configuration::ConfigurationArgs;
+use super::configuration::{ConfigurationArgs, device_named};
 use super::output::{print, print_json};
-use super::profiles::load_file;
-use super::{Failure, configuration};
+use super::{Failure, profiles};
 use crate::engine::device::Device;
 use crate::engine::plan::{self, Read, Tariff};
-use crate::engine::profile::Library;
 use crate::engine::settings::{DeviceSettings, Line, Link, Parity, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::Scalar;
@@ -83,32 +79,15 @@ fn of_profile(id: &str, turnaround: Duration) -> Result<DevicePlan, Failure> {
     let line = Line { baud: 19_200, parity: Parity::Even, stop_bits: 1 };
     let link = Link::Serial { path: String::new(), line, rs485: Rs485::Auto };
     let tariff = Tariff::of(&link, None);
-    if id.ends_with(".yaml") {
-        return Ok(plan_of(id, &load_file(Path::new(id))?, &link, tariff, turnaround, Duration::ZERO));
-    }
-    let library = Library::shipped();
-    if !library.contains(id) {
-        return Err(Failure::wrong(format!(
-            "no profile is called `{id}`; there are {}",
-            library.ids().join(", ")
-        )));
-    }
-    let device = library.load(id).map_err(configuration::faults)?;
-    Ok(plan_of(id, &device, &link, tariff, turnaround, Duration::ZERO))
+    Ok(plan_of(id, &profiles::load(id)?, &link, tariff, turnaround, Duration::ZERO))
 }
 
 fn of_configuration(args: &Args) -> Result<Vec<DevicePlan>, Failure> {
     let settings = args.configuration.load()?;
-    let wanted = |name: &str| args.device.as_deref().is_none_or(|device| device == name);
-    let devices: Vec<_> = settings.devices.iter().filter(|device| wanted(&device.name)).collect();
-    if devices.is_empty() {
-        let names: Vec<&str> = settings.devices.iter().map(|device| device.name.as_str()).collect();
-        let wanted = args.device.as_deref().unwrap_or_default();
-        return Err(Failure::wrong(format!(
-            "no device is called `{wanted}`; there are {}",
-            names.join(", ")
-        )));
-    }
+    let devices: Vec<&DeviceSettings> = match &args.device {
+        Some(name) => vec![device_named(&settings, name)?],
+        None => settings.devices.iter().collect(),
+    };
     Ok(devices
         .into_iter()
         .map(|device| {

@@ -55,8 +55,7 @@ fn refuse_forbidden(device: &Asked, span: Span) -> Result<(), Failure> {
 }
 
 fn read_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
-    let index = asked.point(&args.what)?;
-    let Some(device) = asked.device.clone() else { return Ok(()) };
+    let (device, index) = asked.point(&args.what)?;
     let point = &device.points[index];
     let mut known = vec![None; device.points.len()];
     asked.learn(&device, index, &mut known)?;

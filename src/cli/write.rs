@@ -9,6 +9,7 @@ use crate::engine::address::{Span, Table};
 use crate::engine::command::{CommandFlow, OutcomeKind, Step, words_of};
 use crate::engine::device::Order;
 use crate::engine::modbus::{Answer, Call, RequestError};
+use crate::engine::yaml::Scalar;
 
 /// Write to one device by hand, and read back what it holds then
 ///
@@ -42,13 +43,7 @@ pub struct Args {
 }
 
 fn order(name: &str) -> Result<Order, String> {
-    match name.to_ascii_lowercase().as_str() {
-        "abcd" => Ok(Order::Abcd),
-        "cdab" => Ok(Order::Cdab),
-        "badc" => Ok(Order::Badc),
-        "dcba" => Ok(Order::Dcba),
-        _ => Err("expected abcd, cdab, badc or dcba".into()),
-    }
+    Order::parse(&name.to_ascii_lowercase())
 }
 
 pub fn run(args: Args) -> Result<(), Failure> {
@@ -104,8 +99,7 @@ fn write_words(device: &mut Asked, span: Span, words: &[u16], call: &Call) -> Re
 }
 
 fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
-    let index = asked.point(&args.place)?;
-    let Some(device) = asked.device.clone() else { return Ok(()) };
+    let (device, index) = asked.point(&args.place)?;
     let [wanted] = &args.values[..] else {
         return Err(Failure::wrong("a point takes one value"));
     };
@@ -173,18 +167,10 @@ fn words_of_value(table: Table, value: &str, kind: &str, order: Order) -> Result
                 "i16" => (i16::MIN.into(), i16::MAX.into()),
                 _ => (i16::MIN.into(), u16::MAX.into()),
             };
-            let word = within(low, high)? as u16;
-            return Ok(vec![if order.swaps_bytes() { word.swap_bytes() } else { word }]);
+            return Ok(order.turn(vec![within(low, high)? as u16]));
         }
     };
-    let mut words = vec![(wide >> 16) as u16, wide as u16];
-    if order.low_word_first() {
-        words.reverse();
-    }
-    if order.swaps_bytes() {
-        words.iter_mut().for_each(|word| *word = word.swap_bytes());
-    }
-    Ok(words)
+    Ok(order.turn(vec![(wide >> 16) as u16, wide as u16]))
 }
 
 /// A single address is where the words begin; a span must be filled exactly.

@@ -1,13 +1,12 @@
 //! Starts what runs and ends it in order: the threads of the buses, and a small runtime for the broker and
 //! HTTP.
 
-use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use anyhow::Context;
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, sleep_until};
+use tokio::time::sleep;
 
 use crate::edge::bus_thread::{BusHandle, Threads};
 use crate::edge::clock::Clock;
@@ -20,23 +19,12 @@ use crate::edge::runtime::Runtime;
 use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
-use crate::engine::health::{self, BusReport, DeviceReport, GatewayReport};
-use crate::engine::homeassistant::{self, Gateway};
-use crate::engine::outbox::{Outbox, Tree};
+use crate::engine::health::{self, Bulletin, GatewayReport};
+use crate::engine::homeassistant;
 use crate::engine::profile::Library;
 use crate::engine::reload;
 use crate::engine::settings::Settings;
-use crate::engine::time::Duration;
-use crate::engine::topics::{Message, Topics};
-
-/// What changes for the worse or the better is told at once, but not more often than this. The rest is told
-/// each minute.
-const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// How often each bus is asked although nothing has stirred: it may be stuck.
-const ASK_EVERY: Duration = Duration::from_secs(10);
-
-/// Everything was told, and the broker has most likely taken it, when it is so at so many looks.
-const LOOKS_UNTIL_STORED: u32 = 2;
+use crate::engine::time::{Duration, Time};
 
 /// How long the buses may take to finish what is in flight.
 pub(super) const BUSES_END_WITHIN: Duration = Duration::from_secs(10);
@@ -91,7 +79,7 @@ impl App {
         };
         let plant = Arc::new(Plant::new(settings, library, clock));
         recall(&plant, &state);
-        introduce(&plant.settings(), &plant.topics(), &plant.mailbox());
+        introduce(&plant.settings(), &plant.mailbox());
         let everyone = 0..plant.settings().buses.len();
         let threads = Threads::new(plant.stir().clone());
         let buses = start_buses(&threads, &plant, everyone, clock, &state)?;
@@ -147,39 +135,32 @@ impl App {
 fn recall(plant: &Plant, state: &StateFiles) {
     let wanted = reload::topics_of_devices(&plant.settings());
     plant.mailbox().change(|outbox| outbox.recall(state.take_announced(), state.take_trees(), &wanted));
-    remember_topics(plant, state, BTreeSet::new());
+    remember_topics(plant, state);
 }
 
-/// Stores where something is told from now on, and what is to be taken back: `gone` and what waits for that.
-pub(super) fn remember_topics(plant: &Plant, state: &StateFiles, gone: BTreeSet<String>) {
-    let settings = plant.settings();
-    let mut topics = reload::topics_of_devices(&settings);
-    topics.extend(gone);
-    let base_topic = settings.mqtt.base_topic.clone();
-    let trees = plant.mailbox().look(|outbox| {
-        let (left_behind, formers) = outbox.left_behind();
-        topics.extend(left_behind.iter().cloned());
-        let present = Tree { base_topic, topics };
-        std::iter::once(present).chain(formers.cloned()).collect::<Vec<Tree>>()
-    });
-    state.store_trees(&trees);
+/// Stores where something is told from now on, and what is to be taken back.
+pub(super) fn remember_topics(plant: &Plant, state: &StateFiles) {
+    let told_on = reload::topics_of_devices(&plant.settings());
+    state.store_trees(&plant.mailbox().look(|outbox| outbox.trees(told_on)));
 }
 
-/// What is known of the gateway before anything has happened.
-pub(super) fn introduce(settings: &Settings, topics: &Topics, mailbox: &Mailbox) {
-    mailbox.push(info(settings, topics));
-    if settings.home_assistant.discovery {
-        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
-        mailbox.push(homeassistant::announce_bridge(&gateway).message());
-        for bus in &settings.buses {
-            mailbox.push(homeassistant::announce_bus(&gateway, &bus.name).message());
+/// Stores what the broker has been told, as far as it has most likely arrived.
+fn store_what_is_told(plant: &Plant, state: &StateFiles, now: Time) {
+    let mailbox = plant.mailbox();
+    mailbox.look(|outbox| {
+        if let Some(told) = outbox.announced() {
+            state.store_announced(&told);
         }
+    });
+    if mailbox.settle(now) {
+        remember_topics(plant, state);
     }
 }
 
-/// `bridge/info` while all is well.
-fn info(settings: &Settings, topics: &Topics) -> Message {
-    Message::retained(topics.bridge_info(), health::info_json(settings).to_string())
+/// What is known of the gateway before anything has happened.
+pub(super) fn introduce(settings: &Settings, mailbox: &Mailbox) {
+    mailbox.push(health::info(settings));
+    homeassistant::introduction(settings).into_iter().for_each(|message| mailbox.push(message));
 }
 
 /// Starts the buses of these numbers of the plant's settings. An error means that none of them runs.
@@ -262,106 +243,44 @@ pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
 /// Looks at the gateway when something stirs, and now and then when nothing does: tells its health, and feeds
 /// systemd's watchdog while every bus answers.
 pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc<StateFiles>) {
-    let ask_every = shutdown::watchdog_interval().map_or(ASK_EVERY, |watchdog| watchdog.min(ASK_EVERY));
-    let pause = LOOK_EVERY.min(ask_every);
-    let mut told: Option<Vec<bool>> = None;
-    let mut told_at: Vec<String> = Vec::new();
-    let mut told_info = info(&plant.settings(), &plant.topics());
-    let mut tell_at = Instant::now();
-    let mut seen = None;
-    // For which settings, since which connection, and how often all was told.
-    let mut settled: Option<(Arc<Settings>, u64, u32)> = None;
+    let clock = plant.clock();
+    let mut bulletin = Bulletin::new(&plant.settings(), shutdown::watchdog_interval());
     let mut has_stirred = true;
     loop {
-        let now = Instant::now();
-        let broker = plant.broker();
-        if broker.connected {
-            let store = |outbox: &Outbox| {
-                let told = outbox.announced();
-                told.iter().for_each(|told| state.store_announced(told));
-                told.is_some()
-            };
-            let all_is_told = plant.mailbox().look(store);
-            // What was taken back may be lost with a connection: then it is taken back at the next start.
-            let settings = plant.settings();
-            let since = settled.take_if(|(of, ..)| Arc::ptr_eq(of, &settings));
-            let (connects, looks) =
-                since.map_or((broker.connects, 0), |(_, connects, looks)| (connects, looks));
-            let looks = looks + u32::from(all_is_told && connects == broker.connects);
-            if looks == LOOKS_UNTIL_STORED {
-                remember_topics(&plant, &state, BTreeSet::new());
+        let now = clock.now();
+        store_what_is_told(&plant, &state, now);
+        let wants_report = has_stirred || bulletin.wants_report(now, &plant.broker());
+        let all_respond = if !wants_report && reporter.all_respond().await {
+            true
+        } else {
+            let report = reporter.report(Detail::Devices).await;
+            // Who changes the buses stirs at the end, and has to come to that: this must wait, too, where there
+            // is no bus that could be waited for.
+            if reporter.is_changing() {
+                bulletin.doubt();
+            } else {
+                let mailbox = plant.mailbox();
+                let messages = bulletin.messages(now, &plant.settings(), &report);
+                messages.into_iter().for_each(|message| mailbox.push(message));
             }
-            settled = Some((settings, connects, looks));
-        }
-        let is_news =
-            has_stirred || now >= tell_at || seen != Some([broker.client_id_taken, broker.state_denied]);
-        seen = Some([broker.client_id_taken, broker.state_denied]);
-        if !is_news && reporter.all_respond().await {
-            shutdown::feed_watchdog();
-            has_stirred = stirs(&plant, now, (now + ask_every).min(tell_at), pause).await;
-            continue;
-        }
-        let report = reporter.report(Detail::Devices).await;
-        let responding = report.buses.iter().all(|bus| bus.responding);
-        if responding {
+            report.all_respond()
+        };
+        if all_respond {
             shutdown::feed_watchdog();
         }
-        if reporter.is_changing() {
-            // Not all buses are there; when they are, it is told. Whoever changes them stirs at the end, and
-            // has to come to that: this must wait, too, where there is no bus that could be waited for.
-            (seen, told) = (None, None);
-            stirs(&plant, now, now + pause, pause).await;
-            has_stirred = true;
-            continue;
-        }
-        let (topics, mailbox) = (plant.topics(), plant.mailbox());
-        let states = states(&report);
-        let of_device =
-            |(bus, device): (&BusReport, &DeviceReport)| topics.of_device(&bus.name, &device.name).health();
-        let places: Vec<String> = report.devices().map(of_device).chain([topics.bridge_health()]).collect();
-        // After a reload a device may be new, or tell it elsewhere.
-        let is_time = now >= tell_at || told_at != places;
-        told_at = places;
-        if is_time {
-            tell_at = now + health::TOLD_EVERY;
-        }
-        if is_time || told.as_ref() != Some(&states) {
-            mailbox.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
-            told = Some(states);
-        }
-        if is_time {
-            for (bus, device) in report.devices() {
-                let health = device.health_json(&bus.name).to_string();
-                mailbox.push(Message::retained(topics.of_device(&bus.name, &device.name).health(), health));
-            }
-        }
-        let info = plant.info(&report);
-        if told_info != info {
-            mailbox.push(info.clone());
-            told_info = info;
-        }
-        // A bus that is stuck does not say when it goes on.
-        let next = if responding { (now + ask_every).min(tell_at) } else { now + pause };
-        has_stirred = stirs(&plant, now, next, pause).await || !responding;
+        has_stirred = stirs(&plant, now, bulletin.next_look(now), bulletin.pause()).await;
     }
 }
 
 /// Waits until something stirs (`true`), though not less than `pause` after the look at `looked_at`; or until
 /// `next`.
-async fn stirs(plant: &Plant, looked_at: Instant, next: Instant, pause: Duration) -> bool {
+async fn stirs(plant: &Plant, looked_at: Time, next: Time, pause: Duration) -> bool {
+    let clock = plant.clock();
     tokio::select! {
-        () = sleep_until(next) => false,
+        () = sleep(clock.until(next)) => false,
         () = plant.stir().stirred() => {
-            sleep_until(looked_at + pause).await;
+            sleep(clock.until(looked_at + pause)).await;
             true
         }
     }
-}
-
-/// What is worth telling at once.
-fn states(report: &GatewayReport) -> Vec<bool> {
-    let buses = report.buses.iter().flat_map(|bus| [bus.report.up, bus.report.paused, bus.responding]);
-    let devices = report.devices().map(|(_, device)| device.online);
-    let of_broker = [report.broker.connected, report.broker.client_id_taken, report.broker.state_denied];
-    buses.chain(devices).chain(of_broker).chain([report.configuration_error.is_some()]).collect()
 }

@@ -1,6 +1,9 @@
-//! Small files that the running gateway needs.
+//! Small files: secrets to be read, and how a file is replaced.
 
-use std::fs;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
 
 use anyhow::{Context, bail};
 
@@ -35,6 +38,20 @@ pub fn read_token(token: &Password) -> anyhow::Result<Option<String>> {
         bail!("{place} cannot be a token; expected {}", settings::TOKEN_FORM);
     }
     Ok(found)
+}
+
+/// Puts `bytes` in the place of the file, by way of `temporary` beside it: whoever looks, and whenever the power
+/// fails, it is there whole, old or new.
+pub fn replace(path: &Path, temporary: &Path, mode: u32, bytes: &[u8]) -> io::Result<()> {
+    let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(mode).open(temporary)?;
+    let written =
+        file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| fs::rename(temporary, path));
+    if written.is_err() {
+        // On a full card what is half there would stay for ever.
+        let _ = fs::remove_file(temporary);
+    }
+    written?;
+    File::open(path.parent().unwrap_or(Path::new(".")))?.sync_all()
 }
 
 #[cfg(test)]

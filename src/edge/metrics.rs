@@ -308,15 +308,11 @@ mod tests {
         };
         let report = BusReport {
             name: "cellar".into(),
-            link: "tcp".into(),
-            line: None,
             up: true,
-            reason: None,
-            paused: false,
             counters: Counters { requests: 12, ..Counters::default() },
             load: 0.25,
-            timing: Default::default(),
             devices: vec![device],
+            ..BusReport::default()
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
         let gateway = |responding| GatewayReport {

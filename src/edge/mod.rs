@@ -10,6 +10,7 @@ pub mod files;
 pub mod guarded_link;
 pub mod http;
 pub mod link;
+pub mod lock;
 pub mod metrics;
 pub mod mqtt;
 pub mod plant;

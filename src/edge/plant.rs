@@ -1,15 +1,16 @@
 //! What runs now, for everybody who has to reach it: a new configuration exchanges it under them.
 
-use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::clock::Clock;
+use crate::edge::lock::lock;
 use crate::edge::mqtt::{BrokerState, Mailbox, News};
 use crate::edge::stir::Stir;
 use crate::engine::bus::{Command, Event, Full, REPLACED};
 use crate::engine::command::{Outcome, OutcomeKind, Wish};
-use crate::engine::health::{BrokerReport, GatewayReport};
+use crate::engine::health::BrokerReport;
+use crate::engine::homeassistant;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::request::{Decision, Desk};
@@ -30,41 +31,27 @@ struct Parts {
     desk: Desk,
     /// In the order of the settings.
     buses: Vec<Arc<BusHandle>>,
-    /// Device to bus.
-    bus_of: BTreeMap<String, usize>,
     connection: Option<BrokerState>,
 }
 
 impl Parts {
     fn new(settings: Settings, library: Library) -> Parts {
         let topics = Topics::of(&settings.mqtt);
-        let outbox =
-            Outbox::new(topics.clone(), &settings.home_assistant.prefix, identities(&settings, &topics))
-                .with_values(settings.mqtt.values);
+        let outbox = Outbox::new(
+            topics.clone(),
+            &settings.home_assistant.prefix,
+            homeassistant::identities(&settings),
+        )
+        .with_values(settings.mqtt.values);
         Parts {
             desk: Desk::new(&settings, library),
             topics,
             mailbox: Arc::new(Mailbox::new(outbox)),
             buses: Vec::new(),
-            bus_of: bus_of(&settings),
             connection: None,
             settings: Arc::new(settings),
         }
     }
-}
-
-/// Everything that Home Assistant shall know of this gateway.
-pub fn identities(settings: &Settings, topics: &Topics) -> Vec<String> {
-    if !settings.home_assistant.discovery {
-        return Vec::new();
-    }
-    let buses = settings.buses.iter().map(|bus| topics.bus_identity(&bus.name));
-    let devices = settings.devices.iter().map(|device| topics.identity(&device.name));
-    buses.chain(devices).chain([topics.bridge_identity()]).collect()
-}
-
-fn bus_of(settings: &Settings) -> BTreeMap<String, usize> {
-    settings.devices.iter().map(|device| (device.name.clone(), device.bus)).collect()
 }
 
 impl Plant {
@@ -82,7 +69,6 @@ impl Plant {
     pub fn exchange(&self, settings: Settings, library: Library, buses: Vec<Arc<BusHandle>>) {
         let mut parts = self.parts();
         parts.desk = Desk::new(&settings, library);
-        parts.bus_of = bus_of(&settings);
         parts.settings = Arc::new(settings);
         parts.buses = buses;
     }
@@ -93,6 +79,10 @@ impl Plant {
 
     pub fn set_connection(&self, connection: BrokerState) {
         self.parts().connection = Some(connection);
+    }
+
+    pub fn clock(&self) -> Clock {
+        self.clock
     }
 
     /// Who changes how the gateway is stirs this.
@@ -121,15 +111,8 @@ impl Plant {
         connection.map(|connection| connection.report()).unwrap_or_default()
     }
 
-    /// `bridge/info` as it is with this report.
-    pub fn info(&self, report: &GatewayReport) -> Message {
-        let parts = self.parts();
-        Message::retained(parts.topics.bridge_info(), report.info_json(&parts.settings).to_string())
-    }
-
     fn parts(&self) -> MutexGuard<'_, Parts> {
-        // The parts are whole after every call, whoever panicked meanwhile.
-        self.parts.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.parts)
     }
 
     /// Brings what the broker tells to the buses that it concerns.
@@ -209,13 +192,13 @@ impl Parts {
     }
 
     fn topics_of(&self, device: &str) -> DeviceTopics {
-        let bus = self.bus_of.get(device).and_then(|bus| self.settings.buses.get(*bus));
+        let bus = self.desk.bus_of(device).and_then(|bus| self.settings.buses.get(bus));
         self.topics.of_device(bus.map_or("", |bus| &bus.name), device)
     }
 
     /// Returns the command whose place the event took.
     fn tell_bus_of(&self, device: &str, event: Event) -> Result<Option<Command>, Full> {
-        match self.bus_of.get(device).map(|bus| self.buses.get(*bus)) {
+        match self.desk.bus_of(device).map(|bus| self.buses.get(bus)) {
             Some(bus) => bus.map_or(Err(Full), |bus| bus.send(event)),
             None => {
                 tracing::debug!("a message for `{device}`, which is no device of this gateway");

@@ -1,12 +1,13 @@
 //! The folder of recordings: each a file that Wireshark opens, as many as are wanted.
 
-use std::fs::{self, DirEntry, File, OpenOptions};
-use std::io::{self, ErrorKind, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::fs::{self, DirEntry};
+use std::io::{self, ErrorKind};
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 use crate::edge::clock::Clock;
+use crate::edge::files::replace;
+use crate::edge::lock::lock;
 use crate::engine::bus::Saved;
 use crate::engine::recorder::Recording;
 use crate::engine::recorder::files::{self, Kept};
@@ -20,7 +21,7 @@ static SAVING: Mutex<()> = Mutex::new(());
 /// Makes a file of the recording in `folder`. The bus keeps not more than `keep` of them.
 pub fn save(folder: &Path, recording: &Recording, clock: Clock, keep: usize) -> Result<Saved, String> {
     let cannot = |error: io::Error| format!("`{}` cannot be written: {error}", folder.display());
-    let _alone = SAVING.lock().unwrap_or_else(PoisonError::into_inner);
+    let _alone = lock(&SAVING);
     fs::create_dir_all(folder).map_err(cannot)?;
     let (bytes, frames) = recording.to_pcapng(clock.since_1970_at(recording.made_at));
     let others = kept(folder).map_err(cannot)?;
@@ -32,7 +33,8 @@ pub fn save(folder: &Path, recording: &Recording, clock: Clock, keep: usize) -> 
         }
     }
     let path = folder.join(files::name(&recording.bus, clock.today(), &others));
-    write(&path, &bytes).map_err(cannot)?;
+    // Always the same name: what a loss of power leaves half written is replaced by the next.
+    replace(&path, &folder.join("unfinished"), MODE, &bytes).map_err(cannot)?;
     Ok(Saved { path: path.display().to_string(), frames, why: recording.why.clone() })
 }
 
@@ -44,21 +46,6 @@ fn kept(folder: &Path) -> io::Result<Vec<Kept>> {
         Ok(Kept { name, bytes: entry.metadata().map_or(0, |metadata| metadata.len()) })
     };
     fs::read_dir(folder)?.map(of_entry).collect()
-}
-
-/// Whoever looks finds it whole or not at all.
-fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    // Always the same name: what a loss of power leaves half written is replaced by the next.
-    let temporary = path.with_file_name("unfinished");
-    let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(MODE).open(&temporary)?;
-    let written =
-        file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| fs::rename(&temporary, path));
-    if written.is_err() {
-        // On a full card what is half there would stay for ever.
-        let _ = fs::remove_file(&temporary);
-    }
-    written?;
-    File::open(path.parent().unwrap_or(Path::new(".")))?.sync_all()
 }
 
 #[cfg(test)]

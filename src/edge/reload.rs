@@ -1,6 +1,6 @@
 //! A new configuration while the gateway runs: only what has changed ends, begins or begins anew.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use anyhow::Context;
@@ -11,14 +11,12 @@ use crate::edge::app::{
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
-use crate::edge::mqtt::Mailbox;
-use crate::edge::plant::identities;
 use crate::edge::reports::Reporter;
 use crate::edge::secrets::Secrets;
 use crate::edge::state_files::StateFiles;
 use crate::engine::bus::Event;
-use crate::engine::homeassistant::{self, Gateway};
-use crate::engine::outbox::{Outbox, Tree};
+use crate::engine::homeassistant;
+use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::reload::{self, Change, Fate, Parts};
 use crate::engine::settings::{DeviceSettings, Settings};
@@ -95,13 +93,12 @@ impl App {
         self.reporter.replace(Vec::new());
         end_buses(&self.runtime, self.plant.buses());
         let (old, mailbox) = (self.plant.settings(), self.plant.mailbox());
-        let announced = mailbox.look(Outbox::told_announcements);
-        mailbox.change(|outbox| outbox.take_back_everything());
+        let announced = mailbox.change(Outbox::take_back_everything);
         if let Some(broker) = self.broker.take() {
             self.runtime.block_on(broker.finish());
         }
-        // A broker that is away keeps it until it is back.
-        let is_taken_back = mailbox.look(Outbox::is_empty);
+        let (announced, trees) =
+            mailbox.look(|outbox| outbox.legacy(announced, reload::topics_of_devices(&old)));
         match state {
             Some(state) => {
                 self.state.finish();
@@ -119,11 +116,9 @@ impl App {
         let everyone = 0..settings.buses.len();
         let wanted = reload::topics_of_devices(&settings);
         self.plant.begin_anew(settings, library);
-        let trees = left_at_the_broker(&old, &mailbox, is_taken_back);
-        let announced = if is_taken_back { BTreeMap::new() } else { announced };
         self.plant.mailbox().change(|outbox| outbox.recall(announced, trees, &wanted));
-        remember_topics(&self.plant, &self.state, BTreeSet::new());
-        introduce(&self.plant.settings(), &self.plant.topics(), &self.plant.mailbox());
+        remember_topics(&self.plant, &self.state);
+        introduce(&self.plant.settings(), &self.plant.mailbox());
         let buses = start_buses(&self.threads, &self.plant, everyone, self.clock, &self.state)?;
         self.plant.set_buses(buses.clone());
         self.keys = keys;
@@ -158,7 +153,6 @@ impl App {
             }
         }
         self.take_back(old, &settings);
-        let gone = reload::topics_of_devices(old);
 
         // What was on other buses may come to a bus only now that it has left those.
         let settings_of_threads = Arc::new(settings.clone());
@@ -180,9 +174,8 @@ impl App {
                 }
                 _ => {
                     let mailbox = self.plant.mailbox();
-                    if settings.home_assistant.discovery {
-                        let gateway = Gateway::new(&settings.mqtt, &settings.home_assistant);
-                        mailbox.push(homeassistant::announce_bus(&gateway, name).message());
+                    if let Some(message) = homeassistant::introduction_of_bus(&settings, name) {
+                        mailbox.push(message);
                     }
                     let bus = start_bus(
                         &self.threads,
@@ -204,7 +197,7 @@ impl App {
         }
         let watched = watched(&buses);
         self.plant.exchange(settings, library, buses);
-        remember_topics(&self.plant, &self.state, gone);
+        remember_topics(&self.plant, &self.state);
         self.reporter.replace(watched);
         if parts.rules.is_some() {
             tracing::info!("what holds for every bus has changed, and the buses go on");
@@ -251,10 +244,10 @@ impl App {
     /// Takes back at the broker what the new settings do not have.
     fn take_back(&self, old: &Settings, new: &Settings) {
         let topics = self.plant.topics();
-        let wanted = reload::topics_of_devices(new);
+        let (before, wanted) = (reload::topics_of_devices(old), reload::topics_of_devices(new));
         let changed = reload::changed_devices(old, new);
         self.plant.mailbox().change(|outbox| {
-            outbox.reconfigure(identities(new, &topics), &wanted);
+            outbox.reconfigure(homeassistant::identities(new), &before, &wanted);
             for device in changed {
                 outbox.announced_anew(&topics.identity(&device));
             }
@@ -289,14 +282,6 @@ impl App {
         }
         Ok(())
     }
-}
-
-/// What the old mailbox had told, and other base topics before it, as far as it has not been taken back.
-fn left_at_the_broker(old: &Settings, mailbox: &Mailbox, is_taken_back: bool) -> Vec<Tree> {
-    let (base_topic, topics) = (old.mqtt.base_topic.clone(), reload::topics_of_devices(old));
-    let told = (!is_taken_back).then_some(Tree { base_topic, topics });
-    let formers = mailbox.look(|outbox| outbox.left_behind().1.cloned().collect::<Vec<Tree>>());
-    told.into_iter().chain(formers).collect()
 }
 
 fn on_bus(devices: &[DeviceSettings], bus: usize) -> Vec<DeviceSettings> {

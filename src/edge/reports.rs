@@ -1,11 +1,12 @@
 //! Asks every bus how it is, and notices the one that does not answer.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
 
+use crate::edge::lock::lock;
 use crate::engine::health::{BrokerReport, BusHealth, BusReport, GatewayReport};
 use crate::engine::recorder::Recording;
 use crate::engine::time::Duration;
@@ -192,10 +193,6 @@ fn without_points(mut report: BusReport) -> BusReport {
     report
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -204,15 +201,9 @@ mod tests {
     fn bus(name: &str, requests: u64) -> BusReport {
         BusReport {
             name: name.into(),
-            link: "tcp".into(),
-            line: None,
             up: true,
-            reason: None,
-            paused: false,
             counters: Counters { requests, ..Counters::default() },
-            load: 0.0,
-            timing: Default::default(),
-            devices: Vec::new(),
+            ..BusReport::default()
         }
     }
 

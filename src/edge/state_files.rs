@@ -1,27 +1,24 @@
-//! The files in `state_dir`: one small file for each device, read at the start and replaced as a whole.
-//!
-//! Storing is a thread of its own: a memory card may take seconds to say that it has what it was
-//! given, and a bus waits for nobody.
+//! The files in `state_dir`: one small file for each device, read at the start and replaced as a whole, and what
+//! the broker has been told.
+
+mod claim;
+mod writer;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::hash::{DefaultHasher, Hash, Hasher};
-use std::io::{self, ErrorKind, Write};
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
+use std::sync::Mutex;
 
-use anyhow::{Context, bail};
-use rustix::fs::FlockOperation;
-use rustix::io::Errno;
+use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use crate::edge::lock::lock;
 use crate::engine::memory::{Memories, Memory, Record};
 use crate::engine::outbox::Tree;
-use crate::engine::time::Duration;
-
-/// What could not be stored is tried again after this.
-const TRY_AGAIN_AFTER: Duration = Duration::from_secs(60);
+use claim::lock_folder;
+use writer::Writer;
 
 /// What Home Assistant has been told of this gateway, in `state_dir`.
 const ANNOUNCED: &str = "announced.json";
@@ -33,71 +30,48 @@ const TOPICS: &str = "topics.json";
 pub struct StateFiles {
     /// The newest of each device.
     memories: Mutex<Memories>,
-    /// Devices whose files must not be overwritten.
-    damaged: Mutex<BTreeSet<String>>,
-    /// Devices of which it has been said that nothing is remembered.
-    unknown: Mutex<BTreeSet<String>>,
-    folder: PathBuf,
     recordings: Option<PathBuf>,
-    desk: Arc<Desk>,
-    thread: Mutex<Option<JoinHandle<()>>>,
-    keeps: bool,
-    /// What an earlier run has told Home Assistant, by topic, until somebody takes it.
-    recalled: Mutex<BTreeMap<String, String>>,
-    /// Below which base topics it has told something, until somebody takes it.
-    trees: Mutex<Vec<Tree>>,
-    /// The fingerprints of what is stored of both: the whole lies in the outbox already.
-    announced: Mutex<u64>,
-    topics: Mutex<u64>,
+    /// `None` if nothing is kept.
+    kept: Option<Kept>,
     /// Held as long as this lives.
     _lock: Option<File>,
 }
 
-/// What lies on it waits to be stored: the newest of each device.
-#[derive(Default)]
-struct Desk {
-    waiting: Mutex<Waiting>,
-    changed: Condvar,
+struct Kept {
+    /// Of the devices' files.
+    folder: PathBuf,
+    writer: Writer,
+    /// Devices whose files must not be overwritten.
+    damaged: Mutex<BTreeSet<String>>,
+    /// Devices of which it has been said that nothing is remembered.
+    unknown: Mutex<BTreeSet<String>>,
+    announced: Told<BTreeMap<String, String>>,
+    trees: Told<Vec<Tree>>,
 }
 
-#[derive(Default)]
-struct Waiting {
-    memories: BTreeMap<String, Memory>,
-    /// By the file's name.
-    others: BTreeMap<&'static str, String>,
-    finish: bool,
+/// What the broker has been told, in a file.
+struct Told<T> {
+    file: &'static str,
+    /// By an earlier run, until somebody takes it.
+    recalled: Mutex<T>,
+    /// The fingerprint of what is stored: the whole lies in the outbox already.
+    stored: Mutex<u64>,
 }
 
 impl StateFiles {
     /// Keeps nothing, and remembers nothing.
     pub fn nowhere() -> StateFiles {
         let memories = Memories { unkept: Some("nothing is kept".into()), ..Memories::default() };
-        StateFiles::unkept(memories, None, None)
-    }
-
-    fn unkept(memories: Memories, recordings: Option<PathBuf>, lock: Option<File>) -> StateFiles {
-        StateFiles {
-            damaged: Mutex::default(),
-            unknown: Mutex::default(),
-            memories: Mutex::new(memories),
-            folder: PathBuf::new(),
-            recordings,
-            desk: Arc::default(),
-            thread: Mutex::default(),
-            keeps: false,
-            recalled: Mutex::default(),
-            trees: Mutex::default(),
-            announced: Mutex::default(),
-            topics: Mutex::default(),
-            _lock: lock,
-        }
+        StateFiles { memories: Mutex::new(memories), recordings: None, kept: None, _lock: None }
     }
 
     /// Reads what is remembered of these devices in `state_dir`. What is wrong with the files goes to
     /// the log, and the gateway runs without them. An error means that another gateway has them.
     pub fn open<'d>(state_dir: &Path, devices: impl Iterator<Item = &'d str>) -> anyhow::Result<StateFiles> {
         let folder = state_dir.join("devices");
-        let lock = lock_folder(state_dir)?;
+        // They may find room where a damaged memory must not be overwritten.
+        let recordings = Some(state_dir.join("recordings"));
+        let _lock = lock_folder(state_dir)?;
         let mut memories = Memories::default();
         let mut unknown = Vec::new();
         for device in devices {
@@ -115,39 +89,24 @@ impl StateFiles {
             memories.unkept =
                 probe(&folder).err().map(|error| format!("`{shown}` cannot be written: {error}"));
         }
-        if let Some(reason) = &memories.unkept {
-            tracing::warn!(
-                "{reason}; counts of EEPROM writes end with this run, and `settings` are only compared, \
-                 except where they are enforced"
-            );
-            // They may find room where a damaged memory must not be overwritten.
-            return Ok(StateFiles::unkept(memories, Some(state_dir.join("recordings")), lock));
-        }
-        let recalled: BTreeMap<String, String> = recall_told(&state_dir.join(ANNOUNCED));
-        let announced = fingerprint(recalled.iter().map(|(topic, payload)| (&**topic, &**payload)));
-        let trees: Vec<Tree> = recall_told(&state_dir.join(TOPICS));
-        let topics = fingerprint(topics_in(&trees));
-        let desk = Arc::<Desk>::default();
-        let (of_thread, of_files) = (desk.clone(), folder.clone());
-        let thread = std::thread::Builder::new()
-            .name("state-files".into())
-            .spawn(move || of_thread.work(&folder))
-            .context("no thread can be started")?;
-        Ok(StateFiles {
-            memories: Mutex::new(memories),
-            damaged: Mutex::default(),
-            unknown: Mutex::new(unknown.into_iter().map(String::from).collect()),
-            folder: of_files,
-            recordings: Some(state_dir.join("recordings")),
-            desk,
-            thread: Mutex::new(Some(thread)),
-            keeps: true,
-            recalled: Mutex::new(recalled),
-            trees: Mutex::new(trees),
-            announced: Mutex::new(announced),
-            topics: Mutex::new(topics),
-            _lock: lock,
-        })
+        let kept = match &memories.unkept {
+            Some(reason) => {
+                tracing::warn!(
+                    "{reason}; counts of EEPROM writes end with this run, and `settings` are only compared, \
+                     except where they are enforced"
+                );
+                None
+            }
+            None => Some(Kept {
+                writer: Writer::start(folder.clone())?,
+                folder,
+                damaged: Mutex::default(),
+                unknown: Mutex::new(unknown.into_iter().map(String::from).collect()),
+                announced: Told::recall(state_dir, ANNOUNCED),
+                trees: Told::recall(state_dir, TOPICS),
+            }),
+        };
+        Ok(StateFiles { memories: Mutex::new(memories), recordings, kept, _lock })
     }
 
     /// Where recordings of what was on the wire are kept, if they are.
@@ -162,22 +121,23 @@ impl StateFiles {
 
     /// What is remembered now, also of these devices, which have come since the start.
     pub fn learn<'d>(&self, devices: impl Iterator<Item = &'d str>) -> Memories {
+        let Some(kept) = &self.kept else { return self.memories() };
         let mut memories = lock(&self.memories);
         let mut unkept = None;
-        for device in devices.filter(|_| self.keeps) {
+        for device in devices {
             if memories.devices.contains_key(device) {
                 continue;
             }
-            match recall(&file_of(&self.folder, device)) {
+            match recall(&file_of(&kept.folder, device)) {
                 Ok(Some(memory)) => drop(memories.devices.insert(device.into(), memory)),
                 // It may be in use without anything to remember: then that is no news.
-                Ok(None) if lock(&self.unknown).insert(device.into()) => {
+                Ok(None) if lock(&kept.unknown).insert(device.into()) => {
                     tracing::info!("nothing is remembered yet of {device}");
                 }
                 Ok(None) => {}
                 Err(reason) => {
                     tracing::warn!("{reason}");
-                    lock(&self.damaged).insert(device.into());
+                    lock(&kept.damaged).insert(device.into());
                     unkept = Some(reason);
                 }
             }
@@ -188,126 +148,82 @@ impl StateFiles {
 
     /// Puts a memory where it will be stored. Does not wait for that.
     pub fn store(&self, record: Record) {
-        if self.keeps && !lock(&self.damaged).contains(&record.device) {
+        let Some(kept) = &self.kept else { return };
+        if !lock(&kept.damaged).contains(&record.device) {
             lock(&self.memories).devices.insert(record.device.clone(), record.memory.clone());
-            self.desk.lock().memories.insert(record.device, record.memory);
-            self.desk.changed.notify_all();
+            kept.writer.store(record);
         }
     }
 
     /// What an earlier run has told Home Assistant, by topic; only once.
     pub fn take_announced(&self) -> BTreeMap<String, String> {
-        std::mem::take(&mut lock(&self.recalled))
+        self.kept.as_ref().map_or_else(BTreeMap::new, |kept| kept.announced.take())
     }
 
     /// Keeps what Home Assistant has been told, if it is not what is kept. Does not wait for that.
     pub fn store_announced(&self, told: &BTreeMap<&str, &str>) {
-        let next = fingerprint(told.iter().map(|(topic, payload)| (*topic, *payload)));
-        if self.keeps && std::mem::replace(&mut *lock(&self.announced), next) != next {
-            self.store_text(ANNOUNCED, serde_json::to_string(told));
+        if let Some(kept) = &self.kept {
+            kept.announced.store(told, &kept.writer);
         }
     }
 
     /// Where earlier runs have told something, the last one first; only once.
     pub fn take_trees(&self) -> Vec<Tree> {
-        std::mem::take(&mut lock(&self.trees))
+        self.kept.as_ref().map_or_else(Vec::new, |kept| kept.trees.take())
     }
 
     /// Keeps where something is told, or has to be taken back, if it is not what is kept. Does not wait for that.
     pub fn store_trees(&self, trees: &[Tree]) {
-        let next = fingerprint(topics_in(trees));
-        if self.keeps && std::mem::replace(&mut *lock(&self.topics), next) != next {
-            self.store_text(TOPICS, serde_json::to_string(trees));
+        if let Some(kept) = &self.kept {
+            kept.trees.store(trees, &kept.writer);
         }
-    }
-
-    fn store_text(&self, name: &'static str, text: serde_json::Result<String>) {
-        match text {
-            Ok(text) => drop(self.desk.lock().others.insert(name, text)),
-            Err(error) => tracing::error!("`{name}` cannot be stored: {error}"),
-        }
-        self.desk.changed.notify_all();
     }
 
     /// Waits until everything is stored; the end.
     pub fn finish(&self) {
-        self.desk.lock().finish = true;
-        self.desk.changed.notify_all();
-        let thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner).take();
-        if thread.is_some_and(|thread| thread.join().is_err()) {
-            tracing::error!("the thread that stores the state ended in a panic");
+        if let Some(kept) = &self.kept {
+            kept.writer.finish();
         }
     }
 }
 
-impl Drop for StateFiles {
-    fn drop(&mut self) {
-        self.finish();
-    }
-}
-
-impl Desk {
-    fn lock(&self) -> MutexGuard<'_, Waiting> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn work(&self, folder: &Path) {
-        let mut failed = false;
-        loop {
-            let (memories, others, finish) = self.take(failed);
-            for (name, text) in others {
-                let path = folder.with_file_name(name);
-                if let Err(error) = replace(&path, &text) {
-                    // The broker most likely remembers it too.
-                    tracing::warn!("`{}` cannot be stored: {error}", path.display());
-                }
-            }
-            for (device, memory) in memories {
-                match replace(&file_of(folder, &device), &memory.to_text()) {
-                    Ok(()) if failed => {
-                        failed = false;
-                        tracing::info!("`{}` can be written again", folder.display());
-                    }
-                    Ok(()) => {}
-                    Err(error) if finish => {
-                        tracing::error!("the state of {device} is lost, since it cannot be stored: {error}");
-                    }
-                    Err(error) => {
-                        if !failed {
-                            let path = file_of(folder, &device);
-                            tracing::warn!("`{}` cannot be stored: {error}", path.display());
-                        }
-                        failed = true;
-                        // What has come meanwhile is newer.
-                        self.lock().memories.entry(device).or_insert(memory);
-                    }
-                }
-            }
-            if finish {
-                return;
-            }
-        }
-    }
-
-    /// Waits for something to store, or for the end. After a failure, what waits may wait.
-    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, BTreeMap<&'static str, String>, bool) {
-        let mut waiting = self.lock();
-        if failed && !waiting.finish {
-            let until_finish = |waiting: &mut Waiting| !waiting.finish;
-            let waited = self.changed.wait_timeout_while(waiting, TRY_AGAIN_AFTER, until_finish);
-            waiting = waited.unwrap_or_else(PoisonError::into_inner).0;
-        }
-        let nothing_to_do = |waiting: &mut Waiting| {
-            waiting.memories.is_empty() && waiting.others.is_empty() && !waiting.finish
+impl<T: Default + DeserializeOwned + Hash> Told<T> {
+    /// Nothing if it is not known: the broker most likely knows it.
+    fn recall(state_dir: &Path, file: &'static str) -> Told<T> {
+        let path = state_dir.join(file);
+        let read = match fs::read_to_string(&path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(T::default()),
+            Err(error) => Err(error.to_string()),
+            Ok(text) => serde_json::from_str(&text).map_err(|error| error.to_string()),
         };
-        let mut waiting =
-            self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
-        (std::mem::take(&mut waiting.memories), std::mem::take(&mut waiting.others), waiting.finish)
+        let recalled = read.unwrap_or_else(|reason| {
+            tracing::warn!("`{}` cannot be used ({reason}) and will be written anew", path.display());
+            T::default()
+        });
+        Told { file, stored: Mutex::new(fingerprint(&recalled)), recalled: Mutex::new(recalled) }
+    }
+
+    fn take(&self) -> T {
+        std::mem::take(&mut *lock(&self.recalled))
+    }
+
+    /// `told` is hashed and written as a `T` is.
+    fn store<U: Hash + Serialize + ?Sized>(&self, told: &U, writer: &Writer) {
+        let next = fingerprint(told);
+        if std::mem::replace(&mut *lock(&self.stored), next) == next {
+            return;
+        }
+        match serde_json::to_string(told) {
+            Ok(text) => writer.store_text(self.file, text),
+            Err(error) => tracing::error!("`{}` cannot be stored: {error}", self.file),
+        }
     }
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+fn fingerprint(told: &(impl Hash + ?Sized)) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    told.hash(&mut hasher);
+    hasher.finish()
 }
 
 fn file_of(folder: &Path, device: &str) -> PathBuf {
@@ -342,29 +258,6 @@ fn recall(path: &Path) -> Result<Option<Memory>, String> {
     }
 }
 
-/// What an earlier run has told; nothing if that is not known: the broker most likely does.
-fn recall_told<T: Default + DeserializeOwned>(path: &Path) -> T {
-    let read = match fs::read_to_string(path) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return T::default(),
-        Err(error) => Err(error.to_string()),
-        Ok(text) => serde_json::from_str(&text).map_err(|error| error.to_string()),
-    };
-    read.unwrap_or_else(|reason| {
-        tracing::warn!("`{}` cannot be used ({reason}) and will be written anew", path.display());
-        T::default()
-    })
-}
-
-fn topics_in(trees: &[Tree]) -> impl Iterator<Item = (&str, &str)> {
-    trees.iter().flat_map(|tree| tree.topics.iter().map(|topic| (&*tree.base_topic, &**topic)))
-}
-
-fn fingerprint<'a>(announced: impl Iterator<Item = (&'a str, &'a str)>) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    announced.for_each(|one| one.hash(&mut hasher));
-    hasher.finish()
-}
-
 /// Renames a damaged file to one with `.broken` behind its name, which replaces no other.
 fn keep_aside(path: &Path) -> io::Result<PathBuf> {
     let numbered = (2..=99).map(|number| format!(".broken.{number}"));
@@ -380,58 +273,12 @@ fn keep_aside(path: &Path) -> io::Result<PathBuf> {
     Err(io::Error::other("there are 99 damaged ones already"))
 }
 
-/// Two gateways with one folder would each count as if the other wrote nothing: the second one does not start.
-/// `None` where there can be no lock, since the folder cannot be written (which is told elsewhere) or its
-/// file system knows none.
-fn lock_folder(state_dir: &Path) -> anyhow::Result<Option<File>> {
-    let path = state_dir.join("lock");
-    let open = || File::options().read(true).write(true).create(true).truncate(false).open(&path);
-    let Ok(mut file) = fs::create_dir_all(state_dir).and_then(|()| open()) else { return Ok(None) };
-    let shown = state_dir.display();
-    match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
-        Ok(()) => {
-            // Only for who is refused; without it the lock holds all the same.
-            let told = file.set_len(0).and_then(|()| writeln!(file, "{}", std::process::id()));
-            if let Err(error) = told {
-                tracing::debug!("`{}` cannot be written: {error}", path.display());
-            }
-            Ok(Some(file))
-        }
-        Err(Errno::WOULDBLOCK) => {
-            let holder = fs::read_to_string(&path).unwrap_or_default();
-            let holder = holder.trim().parse::<u32>().map_or(String::new(), |id| format!(" (process {id})"));
-            bail!(
-                "another busker{holder} keeps its state in `{shown}`; end it, or give each a `state_dir` and a \
-                 `base_topic` of its own"
-            )
-        }
-        Err(error) => {
-            tracing::warn!("`{shown}` cannot be locked ({error}); see to it that no other busker uses it");
-            Ok(None)
-        }
-    }
-}
-
 /// Whether files can be made in `folder`, which is made if it is not there.
 fn probe(folder: &Path) -> io::Result<()> {
     fs::create_dir_all(folder)?;
     let path = folder.join(".probe");
     File::create(&path)?;
     fs::remove_file(&path)
-}
-
-/// Puts `text` in place of the file: whoever looks, and whenever the power fails, it is there whole, old
-/// or new.
-fn replace(path: &Path, text: &str) -> io::Result<()> {
-    let folder = path.parent().unwrap_or(Path::new("."));
-    // Somebody may have tidied up.
-    fs::create_dir_all(folder)?;
-    let temporary = path.with_extension("json.new");
-    let mut file = File::create(&temporary)?;
-    file.write_all(text.as_bytes())?;
-    file.sync_all()?;
-    fs::rename(&temporary, path)?;
-    File::open(folder)?.sync_all()
 }
 
 #[cfg(test)]

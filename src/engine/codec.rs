@@ -172,9 +172,8 @@ pub fn raw(form: &Form, words: &[u16]) -> Raw {
     if form.kind.is_text() {
         return raw_text(form, words);
     }
-    let unsigned = most_significant_first(form, words)
-        .into_iter()
-        .fold(0u64, |value, word| value << 16 | u64::from(word));
+    let words = form.order.turn(words.to_vec());
+    let unsigned = words.into_iter().fold(0u64, |value, word| value << 16 | u64::from(word));
     match form.kind {
         Kind::I16 => Raw::Integer(i128::from(unsigned as u16 as i16)),
         Kind::I32 => Raw::Integer(i128::from(unsigned as u32 as i32)),
@@ -226,17 +225,6 @@ fn day_month_year(word: u16) -> Option<String> {
     ((1..=31).contains(&day) && (1..=12).contains(&month)).then(|| format!("{day:02}.{month:02}.201{year}"))
 }
 
-fn most_significant_first(form: &Form, words: &[u16]) -> Vec<u16> {
-    let mut words = words.to_vec();
-    if form.order.low_word_first() {
-        words.reverse();
-    }
-    if form.order.swaps_bytes() {
-        words.iter_mut().for_each(|word| *word = word.swap_bytes());
-    }
-    words
-}
-
 /// What the words (from [`words_at`]) say.
 pub fn read(resolved: &Resolved<'_>, words: &[u16]) -> Reading {
     let Form { kind, elements, .. } = *resolved.form;
@@ -269,9 +257,8 @@ fn invalid_reason(form: &Form, words: &[u16], raw: &Raw) -> Option<String> {
     }
     // A profile may name the word as the manual prints it (0x8000) or as it is decoded (-32768).
     let count = usize::from(form.kind.registers()).min(words.len());
-    let pattern = most_significant_first(form, &words[..count])
-        .into_iter()
-        .fold(0i128, |value, word| value << 16 | i128::from(word));
+    let words = form.order.turn(words[..count].to_vec());
+    let pattern = words.into_iter().fold(0i128, |value, word| value << 16 | i128::from(word));
     let decoded = if let Raw::Integer(raw) = raw { *raw } else { pattern };
     form.invalid
         .iter()

@@ -9,7 +9,7 @@ mod wire;
 mod write;
 
 pub use form::{Case, Decimals, Encoding, Form, Kind, Names, Order, Unit};
-pub use presentation::{Category, Platform, Presentation};
+pub use presentation::{Category, Platform, Presentation, sentence};
 pub use thing::{PRESS, State, Thing, ThingCommand, ThingKind};
 pub use wire::{Forbidden, Intervals, Limits, Quirks, Wire};
 pub use write::{OutOfRange, Write, WriteFunction, WriteRule};
@@ -36,6 +36,12 @@ pub struct Device {
     /// Made of points; empty for most devices.
     pub things: Vec<Thing>,
     pub left_out: Vec<LeftOut>,
+}
+
+impl Device {
+    pub fn point_named(&self, name: &str) -> Option<PointIndex> {
+        self.points.iter().position(|point| point.name == name)
+    }
 }
 
 /// How to be sure that the right device answers at this unit.
@@ -135,12 +141,7 @@ impl Point {
     /// Whether numbers are written to it, in one case at least.
     pub fn takes_numbers(&self) -> bool {
         let rule = self.write.as_ref().map(|write| &write.rule);
-        let is_number = match &self.encoding {
-            Encoding::Plain(form) => form.is_number(),
-            Encoding::Cases { cases, .. } => {
-                cases.iter().filter_map(|case| case.form.as_ref()).any(Form::is_number)
-            }
-        };
+        let is_number = self.encoding.forms().any(Form::is_number);
         is_number && matches!(rule, Some(WriteRule::Any | WriteRule::Range { .. }))
     }
 
@@ -152,23 +153,25 @@ impl Point {
         }
     }
 
+    /// The values by which it can decide about others.
+    pub fn deciding_values(&self) -> Vec<(i128, String)> {
+        let named = self.plain().map(Form::named_values).unwrap_or_default();
+        named.into_iter().map(|(value, name)| (value, name.to_string())).collect()
+    }
+
     /// The points that must be known before this one can be understood.
     pub fn selectors(&self) -> Vec<PointIndex> {
         let mut selectors = Vec::new();
-        let mut of_form = |form: &Form| {
+        for form in self.encoding.forms() {
             if let Some(Decimals::By(point)) = form.decimals {
                 selectors.push(point);
             }
             if let Unit::By(point) = form.unit {
                 selectors.push(point);
             }
-        };
-        match &self.encoding {
-            Encoding::Plain(form) => of_form(form),
-            Encoding::Cases { by, cases } => {
-                cases.iter().filter_map(|case| case.form.as_ref()).for_each(&mut of_form);
-                selectors.push(*by);
-            }
+        }
+        if let Encoding::Cases { by, .. } = self.encoding {
+            selectors.push(by);
         }
         selectors.extend(self.when.iter().map(|condition| condition.point));
         selectors.sort_unstable();

@@ -22,6 +22,44 @@ pub struct News {
     pub data: Value,
 }
 
+/// After so many looks at which there was nothing to tell, it is said that somebody is still there.
+const HEARTBEAT_LOOKS: u32 = 10;
+
+/// What is to be told after a look.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Told {
+    News(Vec<News>),
+    /// That somebody is still there.
+    Heartbeat,
+    Nothing,
+}
+
+/// What those who watch know.
+#[derive(Clone, Debug, Default)]
+pub struct Feed {
+    last: Option<Look>,
+    silent_looks: u32,
+}
+
+impl Feed {
+    /// What those are told who watch already.
+    pub fn look(&mut self, look: Look) -> Told {
+        let news = self.last.as_ref().map_or_else(Vec::new, |last| changes(last, &look));
+        self.last = Some(look);
+        if !news.is_empty() {
+            self.silent_looks = 0;
+            return Told::News(news);
+        }
+        self.silent_looks += 1;
+        if self.silent_looks % HEARTBEAT_LOOKS == 0 { Told::Heartbeat } else { Told::Nothing }
+    }
+
+    /// What a newcomer is told, to know what the others know: [`everything`] as it was last seen.
+    pub fn everything(&self, now: Time) -> Option<News> {
+        self.last.as_ref().map(|last| everything(last, now))
+    }
+}
+
 /// The event `state`: all that the others are a difference to. It may be told some time after the look:
 /// `now` is when.
 pub fn everything(look: &Look, now: Time) -> News {
@@ -123,9 +161,7 @@ fn news(event: &'static str, look: &Look, mut data: Value) -> News {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::health::{
-        BrokerReport, BusReport, Counters, PointReport, Role, ThingReport, good_for,
-    };
+    use crate::engine::health::{BrokerReport, BusReport, PointReport, Role, ThingReport, good_for};
     use crate::engine::time::Duration;
 
     /// A gateway with one device, whose two points were read at once, half a second ago.
@@ -162,25 +198,14 @@ mod tests {
         };
         let report = BusReport {
             name: "cellar".into(),
-            link: "tcp".into(),
-            line: None,
             up: true,
-            reason: None,
-            paused: false,
-            counters: Counters::default(),
             load: 0.1,
-            timing: Default::default(),
             devices: vec![device],
+            ..BusReport::default()
         };
         let broker = BrokerReport { connected: true, ..BrokerReport::default() };
-        Look {
-            at,
-            report: GatewayReport {
-                broker,
-                buses: vec![BusHealth { report, responding: true }],
-                configuration_error: None,
-            },
-        }
+        let buses = vec![BusHealth { report, responding: true }];
+        Look { at, report: GatewayReport { broker, buses, configuration_error: None } }
     }
 
     fn device(look: &mut Look) -> &mut DeviceReport {
@@ -276,6 +301,20 @@ mod tests {
             |look: &mut Look| look.report.buses.clear(),
         ] {
             check(change, &[("state", "/version", json!(env!("CARGO_PKG_VERSION")))]);
+        }
+    }
+
+    #[test]
+    fn who_watches_is_told_what_is_new_and_now_and_then_that_there_is_nothing() {
+        let mut feed = Feed::default();
+        assert_eq!(feed.everything(Time::from_millis(10_000)), None, "nobody has looked");
+        assert_eq!(feed.look(look(10)), Told::Nothing);
+        let first = feed.everything(Time::from_millis(10_250)).expect("it was seen");
+        assert_eq!(first, everything(&look(10), Time::from_millis(10_250)));
+        assert!(matches!(feed.look(look(11)), Told::News(news) if news == changes(&look(10), &look(11))));
+        for round in 1..=25 {
+            let expected = if round % 10 == 0 { Told::Heartbeat } else { Told::Nothing };
+            assert_eq!(feed.look(look(11)), expected, "{round}");
         }
     }
 

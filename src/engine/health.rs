@@ -1,10 +1,12 @@
 //! What a bus and its devices say of themselves: counters, states and reasons.
 
+mod bulletin;
 mod json;
 mod readout;
 mod spread;
 
-pub use json::{device_json, drift_json, info_json, point_json, seconds};
+pub use bulletin::{Bulletin, info};
+pub use json::{device_json, drift_json, point_json, seconds};
 pub use readout::{Readout, ReadoutValue};
 pub use spread::{Percentiles, Spread, SpreadReport, Timing, TimingReport};
 
@@ -101,7 +103,7 @@ impl Counters {
 }
 
 /// A bus as it is now.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct BusReport {
     pub name: String,
     /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`
@@ -394,6 +396,11 @@ impl GatewayReport {
         }
     }
 
+    /// Whether every bus has answered for itself.
+    pub fn all_respond(&self) -> bool {
+        self.buses.iter().all(|bus| bus.responding)
+    }
+
     /// Every device with its bus.
     pub fn devices(&self) -> impl Iterator<Item = (&BusReport, &DeviceReport)> {
         self.buses.iter().flat_map(|bus| bus.report.devices.iter().map(|device| (&bus.report, device)))
@@ -438,19 +445,14 @@ mod tests {
         }
     }
 
-    fn gateway(connected: bool, up: bool, responding: bool, online: &[bool]) -> GatewayReport {
+    pub(super) fn gateway(connected: bool, up: bool, responding: bool, online: &[bool]) -> GatewayReport {
         let devices = online.iter().enumerate().map(|(index, online)| device(&format!("d{index}"), *online));
         let report = BusReport {
             name: "cellar".into(),
-            link: "tcp 127.0.0.1:502".into(),
-            line: None,
             up,
-            reason: None,
-            paused: false,
-            counters: Counters::default(),
             load: 0.123_456,
-            timing: TimingReport::default(),
             devices: devices.collect(),
+            ..BusReport::default()
         };
         let broker = BrokerReport { connected, ..BrokerReport::default() };
         GatewayReport { broker, buses: vec![BusHealth { report, responding }], configuration_error: None }
@@ -491,6 +493,7 @@ mod tests {
         assert_eq!(device["points"][0]["value"], "21.5");
         assert_eq!(device["points"][0]["read_seconds_ago"], 0.5);
     }
+
     #[test]
     fn only_what_was_read_in_time_on_a_bus_that_is_heard_is_fresh() {
         let missing = Some(("offline", "the device is offline".to_string()));

@@ -38,7 +38,9 @@ pub mod homeassistant;
 pub mod outbox;
 pub mod topics;
 
-// Obey: commands with what they are known again by, settings, what outlives a restart, and the bus that ties all of it together.
+// Obey: what arrives, commands with what they are known again by, settings, what outlives a restart, and the bus
+// that ties all of it together.
+pub mod arrivals;
 pub mod bus;
 pub mod command;
 pub mod members;

@@ -9,6 +9,7 @@ mod manner;
 mod pace;
 mod queue;
 mod reconfigure;
+mod taken_back;
 mod too_long;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -24,6 +25,7 @@ use former::Former;
 pub use former::Tree;
 use pace::Pace;
 use queue::{Lane, Queue, Queued};
+use taken_back::TakenBack;
 use too_long::TooLong;
 pub use too_long::may_be_too_long;
 
@@ -50,8 +52,11 @@ pub struct Outbox {
     departed: BTreeMap<String, Announcement>,
     /// On which topics what was announced before was told; the broker shall forget those that are ours no more.
     left_behind: BTreeSet<String>,
+    taken_back: TakenBack,
     /// What this gateway told below other base topics, until it is known whether somebody else is there.
     formers: Vec<Former>,
+    /// Somebody was there: that one is no more this gateway's to take back.
+    is_left_to_others: bool,
     formers_due: Option<Time>,
     claim: Claim,
     retained: BTreeMap<Arc<str>, Retained>,
@@ -59,6 +64,7 @@ pub struct Outbox {
     pace: Pace,
     too_long: TooLong,
     dropped: u64,
+    is_connected: bool,
     /// Counts the retained topics, to send them again in the order in which they first came.
     next_number: u64,
     states_due_at: Option<Time>,
@@ -92,7 +98,9 @@ impl Outbox {
             remembered: BTreeMap::new(),
             departed: BTreeMap::new(),
             left_behind: BTreeSet::new(),
+            taken_back: TakenBack::default(),
             formers: Vec::new(),
+            is_left_to_others: false,
             formers_due: None,
             claim: Claim::default(),
             retained: BTreeMap::new(),
@@ -100,6 +108,7 @@ impl Outbox {
             pace: Pace::default(),
             too_long: TooLong::default(),
             dropped: 0,
+            is_connected: false,
             next_number: 0,
             states_due_at: None,
             tells_once_more: false,
@@ -128,6 +137,7 @@ impl Outbox {
             self.tells_once_more = true;
         }
         self.pace.told(self.is_answer(&message));
+        self.taken_back.handed_over(&message.topic, now);
         Some(message)
     }
 
@@ -197,14 +207,16 @@ impl Outbox {
     /// The broker is there again, and may have forgotten everything: all retained topics are sent
     /// anew, the gateway's own `online` after them, and then what was waiting to be told once.
     pub fn connected(&mut self) {
+        self.is_connected = true;
+        self.doubt_what_was_taken_back();
         self.push_retained(Message::retained(self.topics.bridge_state(), ONLINE));
         let mut once: Vec<Message> = Vec::new();
         let mut removals: Vec<String> = Vec::new();
         for queued in self.queue.take_all() {
             match queued {
                 Queued::Once(message) => once.push(*message),
-                Queued::Removal(topic) if !self.retained.contains_key(&*topic) => removals.push(topic),
-                Queued::Newest(_) | Queued::Removal(_) => {}
+                Queued::Removal(topic) => removals.push(topic),
+                Queued::Newest(_) => {}
             }
         }
         let (last, topics): (Vec<Arc<str>>, Vec<Arc<str>>) =
@@ -217,10 +229,18 @@ impl Outbox {
             self.queue_last(Queued::Newest(topic));
         }
         once.into_iter().for_each(|message| self.queue_last(Queued::Once(Box::new(message))));
+        removals.retain(|topic| !self.retained.contains_key(&**topic) && !self.left_behind.contains(topic));
         removals.into_iter().for_each(|topic| self.queue_last(Queued::Removal(topic)));
         last.into_iter().for_each(|topic| self.queue_last(Queued::Newest(topic)));
         self.retained.values_mut().for_each(|entry| entry.queued = true);
         self.states_due_at = None;
+    }
+
+    /// The connection is lost, or not made yet.
+    pub fn disconnected(&mut self) {
+        self.is_connected = false;
+        self.doubt_what_was_taken_back();
+        self.formers_due = None;
     }
 
     /// Home Assistant has started: it is told of all devices now, and of all values when it has had

@@ -242,7 +242,7 @@ mod tests {
         let wanted: Vec<Wanted> = settings
             .iter()
             .map(|(name, value)| {
-                let point = device.points.iter().position(|point| point.name == *name).expect(name);
+                let point = device.point_named(name).expect(name);
                 Wanted { point, value: value.to_string(), enforce: false }
             })
             .collect();

@@ -2,6 +2,7 @@
 //! configuration, its schema, the service unit.
 
 mod guide;
+mod seldom;
 #[path = "../support/mod.rs"]
 mod support;
 

@@ -11,10 +11,11 @@ use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Child;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex};
 use std::time::Duration;
 
 use busker::edge::clock::Clock;
+use busker::edge::lock::lock;
 use busker::engine::time::Time;
 use tempfile::TempDir;
 
@@ -84,8 +85,4 @@ fn wait_on<T, F>(collected: &Collected<T>, look: impl Fn(&[T]) -> Option<F>) -> 
 fn collect<T>(collected: &Collected<T>, one: T) {
     lock(&collected.0).push(one);
     collected.1.notify_all();
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

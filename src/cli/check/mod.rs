@@ -215,7 +215,7 @@ impl Summary {
 
 impl PollSummary {
     fn text(&self, name: &str) -> String {
-        let reads = if self.reads == 1 { "1 read".into() } else { format!("{} reads", self.reads) };
+        let reads = counted(self.reads, "read");
         match (self.period, self.real_period) {
             (Some(wanted), Some(real)) if real > wanted => {
                 format!("{name}: {reads} in {}, wanted in {}", told(real), told(wanted))

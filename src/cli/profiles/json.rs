@@ -5,7 +5,7 @@ use serde_json::{Map, Value as Json, json};
 use super::access;
 use crate::engine::address::Span;
 use crate::engine::device::{
-    Case, Condition, Decimals, Device, Encoding, Form, Identify, Kind, Order, Point, PointIndex, Thing, Unit,
+    Case, Condition, Decimals, Device, Encoding, Form, Identify, Order, Point, PointIndex, Thing, Unit,
     WriteRule,
 };
 use crate::engine::homeassistant::entity;
@@ -119,7 +119,7 @@ fn point(device: &Device, index: PointIndex) -> Json {
         "unit": plain.and_then(unit),
         "unit_by": plain.and_then(|form| unit_by(device, form)),
         "decimals_by": plain.and_then(|form| decimals_by(device, form)),
-        "difference": point_is_difference(&point.encoding),
+        "difference": point.encoding.forms().any(|form| form.difference),
         "access": access(point),
         "write_at": write.filter(|write| write.at != point.at).map(|write| json!({
             "table": write.at.span.table().name(),
@@ -285,15 +285,6 @@ pub fn usual_registers(device: &Device, index: PointIndex) -> Vec<Option<i128>> 
     registers
 }
 
-fn point_is_difference(encoding: &Encoding) -> bool {
-    match encoding {
-        Encoding::Plain(form) => form.difference,
-        Encoding::Cases { cases, .. } => {
-            cases.iter().filter_map(|case| case.form.as_ref()).any(|form| form.difference)
-        }
-    }
-}
-
 /// The factor from the register to the unit, fixed decimals included.
 fn scale(form: &Form) -> Decimal {
     let shift = match form.decimals {
@@ -374,10 +365,7 @@ fn values(encoding: &Encoding) -> Json {
 }
 
 fn named(form: &Form) -> Json {
-    if form.kind == Kind::Bool {
-        return json!({"0": "OFF", "1": "ON"});
-    }
-    let named = form.names.list().iter().map(|(raw, name)| (raw.to_string(), Json::from(name.as_str())));
+    let named = form.named_values().into_iter().map(|(raw, name)| (raw.to_string(), Json::from(name)));
     named.collect::<Map<_, _>>().into()
 }
 

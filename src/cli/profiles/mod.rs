@@ -14,7 +14,7 @@ use super::output::{self, Table, counted};
 use super::{Failure, configuration};
 use crate::engine::device::{Condition, Device, Encoding, Point, PointIndex, Poll, Unit, WriteRule};
 use crate::engine::profile::{self, Library};
-use crate::engine::yaml::{Diagnostic, list_of_choices};
+use crate::engine::yaml::Diagnostic;
 
 /// List, show, check and document device profiles
 #[derive(Debug, clap::Args)]
@@ -103,11 +103,7 @@ fn list(library: &Library, json: bool) -> Result<(), Failure> {
 }
 
 fn show(library: &Library, id: &str, json: bool) -> Result<(), Failure> {
-    if !library.contains(id) {
-        let choices = list_of_choices(id, &library.ids());
-        return Err(Failure::wrong(format!("there is no profile `{id}`; {choices}")));
-    }
-    let device = library.load(id).map_err(configuration::faults)?;
+    let device = known(library, id)?;
     if json { output::print_json(&json::device(&device)) } else { output::print(&page(&device)) }
 }
 
@@ -142,6 +138,22 @@ fn summary(device: &Device) -> String {
         parts.push(counted(device.things.len(), "thing"));
     }
     parts.join(", ")
+}
+
+/// The device of a shipped profile, or of a profile's file, which ends in `.yaml`.
+pub fn load(profile: &str) -> Result<Device, Failure> {
+    if profile.ends_with(".yaml") {
+        load_file(Path::new(profile))
+    } else {
+        known(&Library::shipped(), profile)
+    }
+}
+
+fn known(library: &Library, id: &str) -> Result<Device, Failure> {
+    if !library.contains(id) {
+        return Err(Failure::wrong(library.unknown(id)));
+    }
+    library.load(id).map_err(configuration::faults)
 }
 
 /// The device of a profile's file that need not be in any folder of profiles.

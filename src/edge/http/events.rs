@@ -1,11 +1,11 @@
-//! `GET /api/events`: passes on what [`feed`] says has changed, to everybody who watches.
+//! `GET /api/events`: passes on what a [`Feed`] says, to everybody who watches.
 //!
 //! While nobody does, nobody is asked. A reader who is slower than the news loses its connection; what
 //! waits for it is bounded.
 
 use std::convert::Infallible;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
 
 use bytes::Bytes;
@@ -15,14 +15,14 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::edge::clock::Clock;
+use crate::edge::lock::lock;
 use crate::edge::reports::{Detail, Reporter};
-use crate::engine::feed::{self, Look, News};
+use crate::engine::feed::{Feed, Look, News, Told};
 use crate::engine::time::{Duration, Time};
 
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 
-/// After so many looks at which there was nothing to tell, a comment says that we are still there.
-const HEARTBEAT_LOOKS: u32 = 10;
+/// A comment, which a browser passes over.
 const HEARTBEAT: &[u8] = b": still here\n\n";
 
 /// How many may watch.
@@ -50,13 +50,13 @@ impl Hub {
     pub fn join(&self) -> Option<EventStream> {
         let seat = self.seats.clone().try_acquire_owned().ok()?;
         let (sender, news) = channel(WAITING_MAX);
-        self.arrived.lock().unwrap_or_else(PoisonError::into_inner).push(sender);
+        lock(&self.arrived).push(sender);
         self.bell.notify_one();
         Some(EventStream { news, _seat: seat })
     }
 
     fn take_arrived(&self) -> Vec<Sender<Bytes>> {
-        std::mem::take(&mut *self.arrived.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut *lock(&self.arrived))
     }
 }
 
@@ -83,46 +83,43 @@ pub async fn tell(hub: Arc<Hub>, reporter: Arc<Reporter>, clock: Clock) {
     let mut ticks = interval(LOOK_EVERY);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut readers: Vec<Sender<Bytes>> = Vec::new();
-    let mut last: Option<Look> = None;
-    let mut silent_looks = 0;
+    let mut feed = Feed::default();
     loop {
         readers.retain(|reader| !reader.is_closed());
         if readers.is_empty() {
             // What was seen before nobody watched is out of date when somebody does.
-            last = None;
+            feed = Feed::default();
             hub.bell.notified().await;
         } else {
             tokio::select! {
                 _ = ticks.tick() => {}
                 // A newcomer in between is told what the others know, and with them what comes next.
                 () = hub.bell.notified() => {
-                    if let Some(look) = &last {
-                        welcome(&hub, &mut readers, look, clock.now());
-                    }
+                    welcome(&hub, &mut readers, &feed, clock.now());
                     continue;
                 }
             }
         }
         let report = reporter.report(Detail::Points).await;
         // After the answer: what a stuck bus said last has grown older while we waited for it.
-        let look = Look { at: clock.now(), report };
-        let news = last.as_ref().map_or_else(Vec::new, |last| feed::changes(last, &look));
-        silent_looks = if news.is_empty() { silent_looks + 1 } else { 0 };
-        if !news.is_empty() {
-            deliver(&mut readers, &text(&news));
-        } else if silent_looks % HEARTBEAT_LOOKS == 0 {
-            deliver(&mut readers, &Bytes::from_static(HEARTBEAT));
+        let at = clock.now();
+        match feed.look(Look { at, report }) {
+            Told::News(news) => deliver(&mut readers, &text(&news)),
+            Told::Heartbeat => deliver(&mut readers, &Bytes::from_static(HEARTBEAT)),
+            Told::Nothing => {}
         }
-        welcome(&hub, &mut readers, &look, look.at);
-        last = Some(look);
+        welcome(&hub, &mut readers, &feed, at);
         ticks.reset();
     }
 }
 
-fn welcome(hub: &Hub, readers: &mut Vec<Sender<Bytes>>, look: &Look, now: Time) {
+fn welcome(hub: &Hub, readers: &mut Vec<Sender<Bytes>>, feed: &Feed, now: Time) {
     let mut newcomers = hub.take_arrived();
-    if !newcomers.is_empty() {
-        deliver(&mut newcomers, &text(&[feed::everything(look, now)]));
+    if newcomers.is_empty() {
+        return;
+    }
+    if let Some(everything) = feed.everything(now) {
+        deliver(&mut newcomers, &text(&[everything]));
         readers.append(&mut newcomers);
     }
 }

@@ -9,12 +9,12 @@ use super::lock;
 use super::mailbox::Mailbox;
 use super::poller::Seen;
 use crate::edge::clock::Clock;
-use crate::engine::command::{OutcomeKind, Wish};
+use crate::engine::arrivals::{Arrival, Arrivals, Mail};
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::settings::Manner;
 use crate::engine::time::{Duration, Time};
-use crate::engine::topics::{self, Incoming, Message, ONLINE, Topics};
+use crate::engine::topics::Topics;
 
 /// What the broker has to tell the rest of the program.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -39,15 +39,13 @@ pub enum News {
         stale: Option<String>,
     },
 }
+
 /// Feeds the library from the outbox and hands on what comes in.
 pub(super) struct Feeder<Tell> {
     pub client: AsyncClient,
     pub clock: Clock,
     pub topics: Topics,
-    pub status_topic: String,
-    pub filters: Vec<String>,
-    /// Those of them where it is told whether somebody is below a base topic that this gateway had.
-    pub former_states: Vec<String>,
+    pub arrivals: Arrivals,
     pub mailbox: Arc<Mailbox>,
     pub state: Arc<Mutex<BrokerReport>>,
     pub connection: Arc<Mutex<Connection>>,
@@ -117,7 +115,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 state.reason = Some(reason);
                 drop(state);
                 self.connected = false;
-                self.mailbox.outbox().listens_no_more();
+                self.mailbox.outbox().disconnected();
                 self.judge_length(closed_on);
                 if self.told_up != Some(false) {
                     self.told_up = Some(false);
@@ -126,20 +124,17 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             }
             Seen::Unsent(messages) => self.mailbox.outbox().give_back(messages),
             Seen::Packet { packet: Packet::Publish(publish), stale_for } => {
-                let payload = String::from_utf8_lossy(&publish.payload).into_owned();
-                // A broker repeats only what it has kept from an earlier connection.
-                let stale = match (publish.dup, stale_for) {
-                    (true, _) => Some("the broker has kept it from an earlier connection".to_string()),
-                    (false, Some(age)) => Some(format!(
-                        "the broker or the way to it was stalled; it may be {} s old",
-                        age.as_secs()
-                    )),
-                    (false, None) => None,
-                };
-                self.receive(&publish.topic, payload, publish.retain, stale);
+                let payload = String::from_utf8_lossy(&publish.payload);
+                self.receive(&Mail {
+                    topic: &publish.topic,
+                    payload: &payload,
+                    retained: publish.retain,
+                    repeated: publish.dup,
+                    stale_for,
+                });
             }
             Seen::Packet { packet: Packet::SubAck(answer), .. } => {
-                let codes = answer.return_codes.iter().zip(&self.filters);
+                let codes = answer.return_codes.iter().zip(self.arrivals.filters());
                 let refused = codes.filter(|(code, _)| **code == SubscribeReasonCode::Failure);
                 let refused: Vec<&str> = refused.map(|(_, filter)| filter.as_str()).collect();
                 if !refused.is_empty() {
@@ -169,57 +164,40 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         }
     }
 
-    /// `stale` says why a command would be too old to be obeyed.
-    fn receive(&mut self, topic: &str, payload: String, retained: bool, stale: Option<String>) {
-        if topic == self.topics.bridge_state() {
-            // What the broker has kept is followed by this gateway's own word.
-            if !retained && !self.ending {
-                self.heard_state(&payload);
+    fn receive(&mut self, mail: &Mail<'_>) {
+        let Mail { topic, payload, retained, .. } = *mail;
+        match self.arrivals.sort(mail) {
+            // The last word is this gateway's own, when it ends.
+            Arrival::OwnState if self.ending => {}
+            Arrival::OwnState => self.heard_state(payload),
+            Arrival::FormerState => {
+                let somebody = self.mailbox.outbox().heard_former(topic, payload);
+                if let Some(base) = somebody {
+                    tracing::warn!(
+                        "what this gateway told below `{base}` before is not taken back: somebody else is online there"
+                    );
+                }
             }
-            return;
-        }
-        if self.former_states.iter().any(|state| state == topic) {
-            let somebody = self.mailbox.outbox().heard_former(topic, &payload);
-            if let Some(base) = somebody {
-                tracing::warn!(
-                    "what this gateway told below `{base}` before is not taken back: somebody else is online there"
-                );
-            }
-            return;
-        }
-        if topic == self.status_topic {
-            // A retained birth message is old news: everything was sent when the connection was made.
-            if payload == ONLINE && !retained {
+            Arrival::HomeAssistantStarted => {
                 tracing::info!("Home Assistant has started: announcing all devices again");
                 self.mailbox.outbox().home_assistant_started(self.clock.now());
             }
-            return;
-        }
-        if topic.ends_with("/config") {
-            if retained {
-                self.mailbox.outbox().found(topic, &payload);
-            }
-            return;
-        }
-        match self.topics.parse(topic) {
-            Some(Incoming::Set { .. }) if !retained && stale.is_some() => {
-                let reason = stale.unwrap_or_default();
+            Arrival::Announcement => self.mailbox.outbox().found(topic, payload),
+            Arrival::Expired { reason, outcome } => {
                 tracing::warn!("`{topic}` is not obeyed: {reason}");
-                let outcome = Wish::parse(&payload).ended(OutcomeKind::Expired, &reason);
-                let topic = topics::outcome_of(topic);
-                self.mailbox.outbox().push(Message::once(topic, outcome.to_json()));
+                self.mailbox.outbox().push(outcome);
             }
-            Some(Incoming::Set { device, point }) => {
-                let (device, point) = (device.to_string(), point.to_string());
+            Arrival::Set { device, point } => {
+                let (device, point, payload) = (device.into(), point.into(), payload.into());
                 (self.tell)(News::Set { device, point, payload, retained });
             }
-            Some(Incoming::Get { device, point }) if !retained => {
-                (self.tell)(News::Get { device: device.to_string(), point: point.to_string() });
+            Arrival::Get { device, point } => {
+                (self.tell)(News::Get { device: device.into(), point: point.into() });
             }
-            Some(Incoming::Request { verb }) => {
-                (self.tell)(News::Request { verb: verb.to_string(), payload, retained, stale });
+            Arrival::Request { verb, stale } => {
+                (self.tell)(News::Request { verb: verb.into(), payload: payload.into(), retained, stale });
             }
-            Some(Incoming::Get { .. }) | None => {}
+            Arrival::Nothing => {}
         }
     }
 
@@ -264,7 +242,8 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         }
         if !self.subscribed {
             let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
-            self.subscribed = self.client.try_subscribe_many(self.filters.iter().map(filter)).is_ok();
+            self.subscribed =
+                self.client.try_subscribe_many(self.arrivals.filters().iter().map(filter)).is_ok();
         }
         self.ask();
         let mut outbox = self.mailbox.outbox();

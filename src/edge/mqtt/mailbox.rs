@@ -1,10 +1,12 @@
 //! What waits for the broker, where every thread can reach it.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 use tokio::sync::Notify;
 
+use crate::edge::lock::lock;
 use crate::engine::outbox::Outbox;
+use crate::engine::time::Time;
 use crate::engine::topics::Message;
 
 /// Where everybody puts messages for the broker, whether it is there or not.
@@ -25,9 +27,15 @@ impl Mailbox {
     }
 
     /// Does something with all that waits or is remembered.
-    pub fn change(&self, change: impl FnOnce(&mut Outbox)) {
-        change(&mut self.outbox());
+    pub fn change<T>(&self, change: impl FnOnce(&mut Outbox) -> T) -> T {
+        let result = change(&mut self.outbox());
         self.news.notify_one();
+        result
+    }
+
+    /// Whether less is worth remembering than before: [`Outbox::settle`].
+    pub fn settle(&self, now: Time) -> bool {
+        self.outbox().settle(now)
     }
 
     /// Looks at what waits or is remembered.
@@ -36,7 +44,6 @@ impl Mailbox {
     }
 
     pub(super) fn outbox(&self) -> MutexGuard<'_, Outbox> {
-        // The outbox is whole after every call, whoever panicked meanwhile.
-        self.outbox.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.outbox)
     }
 }

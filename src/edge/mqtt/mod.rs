@@ -6,7 +6,7 @@ mod losses;
 mod mailbox;
 mod poller;
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use rumqttc::{AsyncClient, LastWill, MqttOptions, QoS};
 use tokio::sync::{mpsc, oneshot};
@@ -18,13 +18,15 @@ use self::losses::Ends;
 pub use self::mailbox::Mailbox;
 use self::poller::Poller;
 use crate::edge::clock::Clock;
+use crate::edge::lock::lock;
 use crate::edge::secrets::Secrets;
+use crate::engine::arrivals::Arrivals;
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::outbox::Outbox;
 use crate::engine::settings::{Mqtt, Settings};
 use crate::engine::time::Duration;
-use crate::engine::topics::{self, OFFLINE, Topics};
+use crate::engine::topics::{OFFLINE, Topics};
 
 /// Requests that the library may hold; the others wait in the outbox, where a newer value replaces an
 /// older one.
@@ -78,6 +80,7 @@ impl Broker {
         let topics = Topics::of(&settings.mqtt);
         let options = options(&settings.mqtt, &topics, secrets);
         let client_id = options.client_id();
+        mailbox.change(Outbox::disconnected);
         let (client, event_loop) = AsyncClient::new(options, IN_FLIGHT);
         let state = Arc::new(Mutex::new(BrokerReport::default()));
         let connection = Arc::new(Mutex::new(Connection::default()));
@@ -97,21 +100,11 @@ impl Broker {
         };
         let poller = tokio::spawn(poller.run());
         let (goodbye, goodbye_heard) = oneshot::channel();
-        let mut filters = topics.subscriptions();
-        let former_states = mailbox.look(Outbox::former_states);
-        filters.extend(former_states.iter().cloned());
-        if settings.home_assistant.discovery {
-            filters.push(settings.home_assistant.status_topic.clone());
-        }
-        // What an earlier run announced, to take away what is gone; all of it without discovery.
-        filters.push(topics::discovery(&settings.home_assistant.prefix, "+"));
         let feeder = Feeder {
             client,
             clock,
             topics,
-            status_topic: settings.home_assistant.status_topic.clone(),
-            filters,
-            former_states,
+            arrivals: Arrivals::new(settings, mailbox.look(Outbox::former_states)),
             mailbox: mailbox.clone(),
             state: state.clone(),
             connection: connection.clone(),
@@ -147,10 +140,6 @@ impl Broker {
             self.feeder.abort();
         }
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn options(mqtt: &Mqtt, topics: &Topics, secrets: Secrets) -> MqttOptions {

@@ -1,7 +1,7 @@
 //! Wishes to words: checked, brought to what the register can hold, or refused with a reason that a person can
 //! act on.
 
-use super::{Resolved, most_significant_first, read, to_unit};
+use super::{Resolved, read, to_unit};
 use crate::engine::device::{Decimals, Form, Kind, Names, OutOfRange, Point, Write, WriteRule};
 use crate::engine::value::{Decimal, Reading};
 
@@ -148,11 +148,10 @@ pub fn encode(
     // Whoever types a value, or makes it of a template, leaves blanks; only in a text they mean something.
     let text = if matches!(form.kind, Kind::Text { .. }) { text } else { text.trim() };
     if let WriteRule::Press { word, .. } = rule {
-        let is_press = text == "PRESS";
-        return if is_press {
+        return if text == WriteRule::PRESS {
             Ok(vec![*word])
         } else {
-            Err(format!("`{text}` is not what presses a button; expected `PRESS`"))
+            Err(format!("`{text}` is not what presses a button; expected `{}`", WriteRule::PRESS))
         };
     }
     if form.since.is_some() {
@@ -325,7 +324,7 @@ fn encode_float(resolved: &Resolved<'_>, rule: &WriteRule, text: &str) -> Result
         register.to_be_bytes().to_vec()
     };
     let words = bytes.chunks(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
-    Ok(in_wire_order(form, words))
+    Ok(form.order.turn(words))
 }
 
 fn encode_integer(form: &Form, raw: i128) -> Vec<u16> {
@@ -335,7 +334,7 @@ fn encode_integer(form: &Form, raw: i128) -> Vec<u16> {
     };
     let count = form.kind.registers();
     let words = (0..count).rev().map(|index| (bits >> (16 * index)) as u16).collect();
-    in_wire_order(form, words)
+    form.order.turn(words)
 }
 
 fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
@@ -345,7 +344,7 @@ fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
             let number = text.get(1..).and_then(|digits| digits.parse::<u8>().ok());
             match (letter, number) {
                 (Some(letter), Some(number)) => {
-                    Ok(in_wire_order(form, vec![u16::from_be_bytes([letter, number])]))
+                    Ok(form.order.turn(vec![u16::from_be_bytes([letter, number])]))
                 }
                 _ => Err(format!("`{text}` is not a letter and a number from 0 to 255, as in `R017`")),
             }
@@ -370,9 +369,4 @@ fn encode_text(form: &Form, text: &str) -> Result<Vec<u16>, String> {
         }
         _ => Err("a date cannot be written".to_string()),
     }
-}
-
-/// The inverse of [`most_significant_first`], which is its own inverse.
-fn in_wire_order(form: &Form, words: Vec<u16>) -> Vec<u16> {
-    most_significant_first(form, &words)
 }

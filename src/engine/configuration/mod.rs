@@ -29,8 +29,8 @@ use crate::engine::settings::{
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
 use crate::engine::yaml::{
-    At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, nearest, parse,
-    read, schema_of,
+    At, Content, Diagnostic, Faults, Json, Map, Node, Place, Read, Source, list_of_choices, parse, read,
+    schema_of,
 };
 
 /// Something that works and may still be a mistake.
@@ -296,7 +296,7 @@ impl Resolver<'_> {
                 self.identities(name, &resolved, &devices);
                 devices.push(DeviceSettings {
                     name: name.0.clone(),
-                    title: device.name.clone().unwrap_or_else(|| title(&name.0)),
+                    title: device.name.clone().unwrap_or_else(|| device::sentence(&name.0)),
                     bus,
                     unit: unit.value.0,
                     device: shared(resolved, &mut distinct),
@@ -341,7 +341,7 @@ impl Resolver<'_> {
     fn identities(&mut self, name: &At<Name>, device: &Device, others: &[DeviceSettings]) {
         for other in others {
             let (own, others_own) = (name.0.as_str(), other.name.as_str());
-            let same = match (within(own, others_own), within(others_own, own)) {
+            let same = match (rest_behind(own, others_own), rest_behind(others_own, own)) {
                 (Some(rest), _) => shared_name(rest, device, &other.device),
                 (_, Some(rest)) => shared_name(rest, &other.device, device).map(|(a, b)| (b, a)),
                 _ => None,
@@ -428,11 +428,7 @@ impl Resolver<'_> {
 
     fn profile(&mut self, wanted: &At<String>) -> Option<Device> {
         if !self.library.contains(wanted) {
-            let remedy = match nearest(wanted, &self.library.ids()) {
-                Some(meant) => format!("did you mean `{meant}`?"),
-                None => "`busker profiles list` lists them".into(),
-            };
-            self.faults.add(&wanted.place, format!("unknown profile `{}`; {remedy}", wanted.value));
+            self.faults.add(&wanted.place, self.library.unknown(wanted));
             return None;
         }
         self.library.load(wanted).map_err(|faults| self.faults.extend(faults)).ok()
@@ -453,7 +449,7 @@ impl Resolver<'_> {
         for point in &device.points {
             let unit = points.0.get(&point.name).and_then(|point| point.get("unit"));
             let place = unit.map_or(points.0.named_at(), |unit| &unit.place);
-            for form in wishes::forms(point) {
+            for form in point.encoding.forms() {
                 if let device::Unit::Fixed(unit) = &form.unit {
                     wishes::hint_at_unit(&point.name, unit, place, &mut self.warnings);
                 }
@@ -488,7 +484,7 @@ impl Resolver<'_> {
 }
 
 /// What stands in `long` behind `short` and a `_`.
-fn within<'n>(long: &'n str, short: &str) -> Option<&'n str> {
+fn rest_behind<'n>(long: &'n str, short: &str) -> Option<&'n str> {
     long.strip_prefix(short)?.strip_prefix('_')
 }
 
@@ -541,13 +537,6 @@ fn section<T: Read + Clone>(file: &Option<Part<T>>) -> Option<T> {
             read(&empty, &mut Faults::default())
         }
     }
-}
-
-/// `heating_relays` → `Heating relays`.
-fn title(name: &str) -> String {
-    let mut letters = name.chars();
-    let first = letters.next().map(|first| first.to_ascii_uppercase());
-    first.into_iter().chain(letters).map(|c| if c == '_' { ' ' } else { c }).collect()
 }
 
 /// A duration as people write it here: `250ms`, `1.5s`, `10m`.

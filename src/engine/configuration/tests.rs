@@ -63,7 +63,7 @@ devices:
 ";
     let (settings, _) = load("f", text.as_bytes(), &Library::shipped()).expect("a good file");
     let device = &settings.devices[0].device;
-    let index = |name: &str| device.points.iter().position(|point| point.name == name).expect(name);
+    let index = |name: &str| device.point_named(name).expect(name);
     let reading = |name: &str, switches: [i128; 2], word: u16| {
         let mut known = vec![None; device.points.len()];
         known[index("dip_switch_1")] = Some(switches[0]);

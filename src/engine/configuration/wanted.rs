@@ -12,7 +12,7 @@ pub fn check(file: &Map<String, Setting>, device: &Device, faults: &mut Faults) 
     let mut found = Vec::new();
     let mut places = Vec::new();
     for (name, setting) in file.iter() {
-        let Some(point) = device.points.iter().position(|point| point.name == name.value) else {
+        let Some(point) = device.point_named(name) else {
             faults.add(&name.place, unknown_point(name, device));
             continue;
         };

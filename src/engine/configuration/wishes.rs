@@ -1,9 +1,7 @@
 //! What the owner of a device wishes for single points of its profile.
 
 use crate::engine::configuration::file::PointWish;
-use crate::engine::device::{
-    self, Condition, Device, Encoding, Form, Kind, Point, PointIndex, Poll, Thing, Unit,
-};
+use crate::engine::device::{self, Condition, Device, Encoding, Point, PointIndex, Poll, Thing, Unit};
 use crate::engine::profile::file;
 use crate::engine::units::{self, Release};
 use crate::engine::yaml::{At, Faults, Map, Node, Place, list_of_choices, nearest, read};
@@ -12,7 +10,7 @@ use crate::engine::yaml::{At, Faults, Map, Node, Place, list_of_choices, nearest
 pub fn apply(node: &Node, device: &mut Device, release: Release, faults: &mut Faults, warnings: &mut Faults) {
     let Some(wishes): Option<Map<String, PointWish>> = read(node, faults) else { return };
     for (name, wish) in wishes.iter() {
-        match device.points.iter().position(|point| point.name == name.value) {
+        match device.point_named(name) {
             Some(point) => {
                 apply_one(point, wish, device, faults, warnings);
                 if let Some(class) = &wish.presentation.device_class {
@@ -72,7 +70,7 @@ fn apply_one(
         hint_at_unit(&point.name, unit, &unit.place, warnings);
     }
     if let Some(deadband) = &wish.deadband {
-        if !forms(point).any(|form| form.is_number() || form.since.is_some()) {
+        if !point.encoding.forms().any(|form| form.is_number() || form.since.is_some()) {
             faults.add(
                 &deadband.place,
                 format!("`{}` is no number; only a number has a `deadband`", point.name),
@@ -193,17 +191,13 @@ fn choose_range(point: &mut Point, range: &At<String>, faults: &mut Faults) {
 /// The owner says while which switches stand how a reading is to be believed.
 fn add_conditions(index: PointIndex, wish: &PointWish, device: &mut Device, faults: &mut Faults) {
     for (name, wanted) in wish.when.iter() {
-        let Some(selector) = device.points.iter().position(|point| point.name == name.value.0) else {
+        let Some(selector) = device.point_named(&name.value.0) else {
             let known: Vec<&str> = device.points.iter().map(|point| point.name.as_str()).collect();
             let choices = list_of_choices(&name.value.0, &known);
             faults.add(&name.place, format!("no point is called `{}`; {choices}", name.value.0));
             continue;
         };
-        let names: Vec<(i128, String)> = match device.points[selector].plain() {
-            Some(form) if form.kind == Kind::Bool => vec![(0, "OFF".into()), (1, "ON".into())],
-            Some(form) => form.names.list().to_vec(),
-            None => Vec::new(),
-        };
+        let names = device.points[selector].deciding_values();
         if names.is_empty() || !device.points[selector].is_read() {
             faults.add(
                 &name.place,
@@ -253,7 +247,7 @@ fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults, warn
     let look = &wish.presentation;
     let classes = [&look.device_class, &look.state_class, &wish.unit].into_iter().flatten();
     let place = classes.map(|class| &class.place).next();
-    for form in forms(point) {
+    for form in point.encoding.forms() {
         let platforms = units::platforms(point, form);
         if let Some(platform) = &look.r#as {
             if !platforms.contains(&platform.value) {
@@ -319,7 +313,7 @@ pub fn check_release(device: &Device, release: Release, place: &Place, faults: &
 
 fn check_release_of(point: &Point, release: Release, place: &Place, faults: &mut Faults) {
     let Some(class) = point.presentation.device_class.as_deref() else { return };
-    let since = forms(point).map(|form| match &form.unit {
+    let since = point.encoding.forms().map(|form| match &form.unit {
         Unit::Fixed(unit) => (units::known_since(class, Some(unit)), Some(unit)),
         Unit::None | Unit::By(_) => (units::known_since(class, None), None),
     });
@@ -334,12 +328,4 @@ fn check_release_of(point: &Point, release: Release, place: &Place, faults: &mut
             ),
         );
     }
-}
-
-pub fn forms(point: &Point) -> impl Iterator<Item = &Form> {
-    let (plain, cases) = match &point.encoding {
-        Encoding::Plain(form) => (Some(form), [].as_slice()),
-        Encoding::Cases { cases, .. } => (None, cases.as_slice()),
-    };
-    plain.into_iter().chain(cases.iter().filter_map(|case| case.form.as_ref()))
 }

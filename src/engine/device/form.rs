@@ -16,6 +16,17 @@ pub enum Encoding {
     },
 }
 
+impl Encoding {
+    /// Every interpretation.
+    pub fn forms(&self) -> impl Iterator<Item = &Form> {
+        let (plain, cases) = match self {
+            Encoding::Plain(form) => (Some(form), [].as_slice()),
+            Encoding::Cases { cases, .. } => (None, cases.as_slice()),
+        };
+        plain.into_iter().chain(cases.iter().filter_map(|case| case.form.as_ref()))
+    }
+}
+
 #[derive(Clone, Debug, PartialEq)]
 pub struct Case {
     /// What the deciding register holds.
@@ -76,6 +87,14 @@ impl Form {
     pub fn is_number(&self) -> bool {
         let is_enumeration = matches!(self.names, Names::All(_));
         self.kind != Kind::Bool && !self.kind.is_text() && !is_enumeration && self.since.is_none()
+    }
+
+    /// The register values that are told by a name; a flag's are `OFF` and `ON`.
+    pub fn named_values(&self) -> Vec<(i128, &str)> {
+        match self.kind {
+            Kind::Bool => vec![(0, "OFF"), (1, "ON")],
+            _ => self.names.list().iter().map(|(value, name)| (*value, name.as_str())).collect(),
+        }
     }
 }
 
@@ -189,6 +208,17 @@ impl Order {
 
     pub const fn swaps_bytes(self) -> bool {
         matches!(self, Order::Badc | Order::Dcba)
+    }
+
+    /// One value's words, the most significant first, to this order; and from it back again.
+    pub fn turn(self, mut words: Vec<u16>) -> Vec<u16> {
+        if self.low_word_first() {
+            words.reverse();
+        }
+        if self.swaps_bytes() {
+            words.iter_mut().for_each(|word| *word = word.swap_bytes());
+        }
+        words
     }
 }
 

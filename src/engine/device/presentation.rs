@@ -12,6 +12,13 @@ pub struct Presentation {
     pub enabled: Option<bool>,
 }
 
+impl Presentation {
+    /// What people call a point or a thing of this name.
+    pub fn title(&self, name: &str) -> String {
+        self.name.clone().unwrap_or_else(|| sentence(name))
+    }
+}
+
 /// Home Assistant's platforms: those that a single point can be, and those of things.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Platform {
@@ -73,4 +80,11 @@ impl Category {
             Category::Diagnostic => "diagnostic",
         }
     }
+}
+
+/// `channel_3_value` as people write it: `Channel 3 value`.
+pub fn sentence(name: &str) -> String {
+    let words = name.replace('_', " ");
+    let mut letters = words.chars();
+    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
 }

@@ -85,3 +85,8 @@ pub enum WriteRule {
     /// A button: this word and nothing else. A self-clearing one may read back as zero.
     Press { word: u16, self_clearing: bool },
 }
+
+impl WriteRule {
+    /// What is written to a button.
+    pub const PRESS: &str = "PRESS";
+}

@@ -6,7 +6,37 @@ use super::announcement::{Announcement, Gateway};
 use super::diagnostics::{Place, object};
 use crate::engine::device::Poll;
 use crate::engine::health::TOLD_EVERY;
-use crate::engine::topics::{OFFLINE, ONLINE};
+use crate::engine::settings::Settings;
+use crate::engine::topics::{Message, OFFLINE, ONLINE, Topics};
+
+/// The identities of everything that Home Assistant shall know: the gateway, its buses and its devices.
+pub fn identities(settings: &Settings) -> Vec<String> {
+    if !settings.home_assistant.discovery {
+        return Vec::new();
+    }
+    let topics = Topics::of(&settings.mqtt);
+    let buses = settings.buses.iter().map(|bus| topics.bus_identity(&bus.name));
+    let devices = settings.devices.iter().map(|device| topics.identity(&device.name));
+    buses.chain(devices).chain([topics.bridge_identity()]).collect()
+}
+
+/// What is announced before anything is known of the devices: the gateway, then its buses.
+pub fn introduction(settings: &Settings) -> Vec<Message> {
+    let of_gateway = announcing(settings).map(|gateway| announce_bridge(&gateway).message());
+    let buses = settings.buses.iter().filter_map(|bus| introduction_of_bus(settings, &bus.name));
+    of_gateway.into_iter().chain(buses).collect()
+}
+
+/// The same of one bus.
+pub fn introduction_of_bus(settings: &Settings, bus: &str) -> Option<Message> {
+    announcing(settings).map(|gateway| announce_bus(&gateway, bus).message())
+}
+
+/// `None` where nothing is announced.
+fn announcing(settings: &Settings) -> Option<Gateway> {
+    let home_assistant = &settings.home_assistant;
+    home_assistant.discovery.then(|| Gateway::new(&settings.mqtt, home_assistant))
+}
 
 /// The gateway: one entity that says whether it is connected. Announced before all others, which
 /// name it as what they are reached through.

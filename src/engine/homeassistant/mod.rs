@@ -20,9 +20,10 @@ pub use announcement::{Announcement, Gateway, Outline, farewell};
 pub use beside::companions;
 pub use device::announcement;
 pub use entity::Entity;
-pub use gateway::{announce_bridge, announce_bus};
-pub use point::{entity, is_settled, sentence};
-pub use thing::name_of_thing;
+#[cfg(test)]
+use gateway::{announce_bridge, announce_bus};
+pub use gateway::{identities, introduction, introduction_of_bus};
+pub use point::{entity, is_settled};
 
 #[cfg(test)]
 mod tests;

@@ -5,7 +5,7 @@ use super::entity::Entity;
 use super::thing;
 use crate::engine::codec::{self, Limits, Resolved};
 use crate::engine::device::{
-    Category, Device, Encoding, Form, Kind, Names, Platform, Point, PointIndex, Poll,
+    Category, Device, Encoding, Form, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
 };
 use crate::engine::units;
 use crate::engine::value::Missing;
@@ -24,13 +24,13 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
     let platform = point.presentation.platform.filter(|wished| platforms.contains(wished));
     let platform = platform.unwrap_or(platforms[0]);
     let presentation = &point.presentation;
-    let name = presentation.name.clone().unwrap_or_else(|| sentence(&point.name));
+    let name = presentation.title(&point.name);
     let key = format!("{}{}", key(point, &resolved), shown.key_ending());
     let mut entity = Entity {
         category: category(point, platform),
         icon: presentation.icon.clone().filter(|icon| icon.starts_with("mdi:")),
         enabled: presentation.enabled.unwrap_or(point.is_read() || point.write.is_some()),
-        press: (platform == Platform::Button).then(|| "PRESS".into()),
+        press: (platform == Platform::Button).then(|| WriteRule::PRESS.into()),
         ..Entity::new(key, platform, name)
     };
     if entity.is_number(&resolved) {
@@ -211,18 +211,11 @@ pub(super) fn slug(text: &str) -> String {
     slug.trim_end_matches('_').to_string()
 }
 
-/// `channel_3_value` as people write it: `Channel 3 value`.
-pub fn sentence(name: &str) -> String {
-    let words = name.replace('_', " ");
-    let mut letters = words.chars();
-    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::engine::address::{Address, Span, Table};
-    use crate::engine::device::{Decimals, Unit, Write, WriteRule};
+    use crate::engine::device::{Decimals, Unit, Write};
     use crate::engine::homeassistant::beside::companions;
     use crate::engine::test_device::device_of;
     use crate::engine::time::Date;

@@ -7,7 +7,6 @@ use std::ops::Deref;
 use serde_json::{Map, Value, json};
 
 use super::device::name_beside;
-use super::point::sentence;
 use crate::engine::codec;
 use crate::engine::device::{Device, PRESS, Point, PointIndex, Thing, ThingKind};
 use crate::engine::settings::DeviceSettings;
@@ -60,11 +59,6 @@ pub(super) fn as_shown<'d>(
     Some(shown)
 }
 
-/// What people read beside the device's name, in sentence case.
-pub fn name_of_thing(thing: &Thing) -> String {
-    thing.presentation.name.clone().unwrap_or_else(|| sentence(&thing.name))
-}
-
 /// The discovery component of a thing; `None` while it does not live.
 pub(super) fn thing_component(
     identity: &str,
@@ -78,7 +72,7 @@ pub(super) fn thing_component(
     }
     let presentation = &thing.presentation;
     let platform = thing.kind.name();
-    let name = name_of_thing(thing);
+    let name = presentation.title(&thing.name);
     let mut component = Map::new();
     let mut put = |key: &str, value: Value| component.insert(key.into(), value);
     put("platform", platform.into());

@@ -35,6 +35,7 @@ impl Outbox {
     pub(super) fn next_left_behind(&mut self) -> Option<Message> {
         while let Some(topic) = self.left_behind.pop_first() {
             if !self.is_told(&topic) {
+                self.taken_back.add(&topic);
                 return Some(Message::retained(topic, ""));
             }
         }

@@ -14,7 +14,7 @@ use crate::engine::topics::{Message, ONLINE, Topics};
 const LISTEN_FOR: Duration = Duration::from_secs(2);
 
 /// The retained topics of a gateway's devices below one base topic; kept in `state_dir`.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Tree {
     pub base_topic: String,
     pub topics: BTreeSet<String>,
@@ -56,9 +56,8 @@ impl Outbox {
         }
     }
 
-    /// What is to be taken back, beside what is told now; worth remembering as long as it is not.
-    pub fn left_behind(&self) -> (&BTreeSet<String>, impl Iterator<Item = &Tree>) {
-        (&self.left_behind, self.formers.iter().map(|former| &former.tree))
+    pub(super) fn former_trees(&self) -> impl Iterator<Item = Tree> + '_ {
+        self.formers.iter().map(|former| former.tree.clone())
     }
 
     /// Where it is told whether somebody is below a base topic that this gateway had.
@@ -71,15 +70,14 @@ impl Outbox {
         self.formers_due = (!self.formers.is_empty()).then(|| now + LISTEN_FOR);
     }
 
-    /// The connection is lost before everything was told.
-    pub fn listens_no_more(&mut self) {
-        self.formers_due = None;
-    }
-
     /// What stands on one of [`Outbox::former_states`]. The base topic that is left alone, since somebody is there.
     pub fn heard_former(&mut self, topic: &str, payload: &str) -> Option<String> {
         let at = self.formers.iter().position(|former| former.topics().bridge_state() == topic)?;
-        (payload == ONLINE).then(|| self.formers.remove(at).tree.base_topic)
+        if payload != ONLINE {
+            return None;
+        }
+        self.is_left_to_others = true;
+        Some(self.formers.remove(at).tree.base_topic)
     }
 
     /// The broker remembers this announcement, which is not of the present base topic.
@@ -183,8 +181,9 @@ mod tests {
         outbox.wake(now);
         outbox.listens(now);
         let due = outbox.wake_at().expect("it is waited for");
-        outbox.listens_no_more();
+        outbox.disconnected();
         outbox.wake(due);
+        outbox.connected();
         outbox.listens(due);
         outbox.wake(due);
         outbox.wake(due + LISTEN_FOR);
@@ -198,7 +197,8 @@ mod tests {
         assert_eq!(outbox.heard_former("old/bridge/state", "online"), Some("old".to_string()));
         outbox.wake(Time::from_millis(60_000));
         check_sent(&mut outbox, &["busker/bridge/state online"]);
-        assert_eq!(outbox.left_behind().1.count(), 0);
+        assert!(outbox.settle(Time::from_millis(60_000)), "it is forgotten, not to be taken back later");
+        assert_eq!(outbox.trees(BTreeSet::new()).len(), 1, "only the present one");
     }
 
     #[test]
@@ -212,7 +212,7 @@ mod tests {
         );
         // Somebody may have told it meanwhile, another device perhaps.
         retained(&mut outbox, "busker/boiler/late", "7");
-        assert_eq!(outbox.left_behind().0.len(), 2);
+        assert_eq!(outbox.trees(BTreeSet::new()), [tree("busker", &["busker/boiler/late", old])]);
         check_sent(&mut outbox, &["busker/boiler/late 7", "busker/boiler/old "]);
         assert_eq!(take_all(&mut outbox), []);
     }

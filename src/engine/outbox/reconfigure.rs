@@ -1,16 +1,25 @@
 //! What becomes of retained topics when the configuration changes while the gateway runs.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use crate::engine::homeassistant::Announcement;
 use crate::engine::topics::{self, Message};
 
-use super::{Outbox, Queued, Rank};
+use super::{Outbox, Queued, Rank, Tree};
 
 impl Outbox {
     /// The gateway has something else now: `identities` as for [`Outbox::new`], and on `wanted` its devices
-    /// tell something. What it has told of anything else is taken back at the broker.
-    pub fn reconfigure(&mut self, identities: impl IntoIterator<Item = String>, wanted: &BTreeSet<String>) {
+    /// tell something, on `before` they did. What it has told of anything else, perhaps only in an earlier run,
+    /// is taken back at the broker.
+    pub fn reconfigure(
+        &mut self,
+        identities: impl IntoIterator<Item = String>,
+        before: &BTreeSet<String>,
+        wanted: &BTreeSet<String>,
+    ) {
+        let told_earlier = before.difference(wanted).filter(|topic| !self.retained.contains_key(&***topic));
+        self.left_behind.extend(told_earlier.cloned());
         let prefix = self.discovery_prefix.trim_end_matches("/device/").to_string();
         let own = identities.into_iter().map(|identity| topics::discovery(&prefix, &identity));
         self.own_devices = own.collect();
@@ -22,6 +31,7 @@ impl Outbox {
                 }
             } else if !wanted.contains(&*topic) {
                 self.take_back(&topic);
+                self.taken_back.add(&topic);
             }
         }
         let own = &self.own_devices;
@@ -39,25 +49,39 @@ impl Outbox {
     }
 
     /// The gateway will be another one: nothing that it told stays at the broker, but that it is offline.
-    pub fn take_back_everything(&mut self) {
+    /// Returns the announcements that stood until now, by topic, told already or not.
+    pub fn take_back_everything(&mut self) -> BTreeMap<String, String> {
         // First what Home Assistant was announced, so that nobody reads anything out of the empty messages.
         let announced = self.in_order(|rank| rank == Rank::Discovery);
         let others = self.in_order(|rank| rank != Rank::Discovery && rank != Rank::BridgeState);
+        let payload = |topic: &Arc<str>| (topic.to_string(), self.retained[topic].payload.clone());
+        let stood = announced.iter().map(payload).collect();
         for topic in announced.into_iter().chain(others) {
             self.take_back(&topic);
         }
+        stood
     }
 
-    /// All announcements that stand, by topic, told already or not.
-    pub fn told_announcements(&self) -> BTreeMap<String, String> {
-        let announced = self.retained.iter().filter(|(topic, _)| self.rank(topic) == Rank::Discovery);
-        announced.map(|(topic, entry)| (topic.to_string(), entry.payload.clone())).collect()
+    /// What the gateway's next outbox has to [`Outbox::recall`] when this one has ended: `announced` is what
+    /// [`Outbox::take_back_everything`] returned, `told_on` is where the devices told something.
+    pub fn legacy(
+        &self,
+        announced: BTreeMap<String, String>,
+        told_on: BTreeSet<String>,
+    ) -> (BTreeMap<String, String>, Vec<Tree>) {
+        if self.is_empty() {
+            // Everything has been taken back.
+            (BTreeMap::new(), self.former_trees().collect())
+        } else {
+            (announced, self.trees(told_on))
+        }
     }
 
     /// What Home Assistant has been told of everything that this gateway has, by topic; `None` while it has not
     /// been told all of it yet. Worth remembering: a broker may forget it, and Home Assistant does not.
     pub fn announced(&self) -> Option<BTreeMap<&str, &str>> {
-        let is_told = self.is_empty()
+        let is_told = self.is_connected
+            && self.is_empty()
             && self.formers.is_empty()
             && self.remembered.is_empty()
             && self.states_due_at.is_none();
@@ -97,6 +121,7 @@ impl Outbox {
 
 #[cfg(test)]
 mod tests {
+    use super::super::taken_back::ARRIVES_WITHIN;
     use super::*;
     use crate::engine::time::Time;
     use crate::engine::topics::Topics;
@@ -128,8 +153,8 @@ mod tests {
     }
 
     fn without_the_pump(outbox: &mut Outbox) {
-        let wanted = ["busker/boiler/availability", "busker/boiler/flow"].map(String::from);
-        outbox.reconfigure(["busker_bridge", "busker_boiler"].map(String::from), &wanted.into());
+        let wanted = ["busker/boiler/availability", "busker/boiler/flow"].map(String::from).into();
+        outbox.reconfigure(["busker_bridge", "busker_boiler"].map(String::from), &BTreeSet::new(), &wanted);
     }
 
     const TAKEN_BACK: [&str; 3] =
@@ -140,6 +165,7 @@ mod tests {
         let mut outbox = outbox();
         without_the_pump(&mut outbox);
         assert_eq!(sent(&mut outbox), TAKEN_BACK);
+        assert!(outbox.settle(Time(0) + ARRIVES_WITHIN));
         outbox.connected();
         let again = sent(&mut outbox);
         assert_eq!(again.len(), 6, "{again:?}");
@@ -158,6 +184,19 @@ mod tests {
         assert!(TAKEN_BACK[..2].iter().all(|message| is_sent(message)), "{sent:?}");
         assert!(is_sent("busker/boiler/old 8"), "{sent:?}");
         assert!(!is_sent(TAKEN_BACK[2]), "{sent:?}");
+    }
+
+    #[test]
+    fn what_cannot_be_taken_back_is_left_to_the_next_outbox() {
+        let (mut outbox, told_on) = (outbox(), BTreeSet::from(["busker/boiler/flow".to_string()]));
+        let announced = outbox.take_back_everything();
+        let boiler = "homeassistant/device/busker_boiler/config";
+        assert_eq!((announced.len(), announced[boiler].as_str()), (3, "{}"));
+        let (of_boiler, trees) = outbox.legacy(announced.clone(), told_on.clone());
+        assert_eq!(of_boiler, announced);
+        assert_eq!(trees, [Tree { base_topic: "busker".into(), topics: told_on.clone() }]);
+        sent(&mut outbox);
+        assert_eq!(outbox.legacy(announced, told_on), (BTreeMap::new(), Vec::new()));
     }
 
     #[test]
@@ -207,5 +246,7 @@ mod tests {
         assert_eq!(sent(&mut outbox), [""; 0], "once is enough");
         let told = outbox.announced().expect("all of it is told");
         assert_eq!(told, BTreeMap::from([(boiler.as_str(), present.as_str())]));
+        outbox.disconnected();
+        assert_eq!(outbox.announced(), None, "the last of it may not have arrived");
     }
 }

@@ -262,6 +262,7 @@ impl<'f> Expansion<'_, 'f> {
         }
         span.map(|span| Address { span, bits })
     }
+
     fn lies_beyond(&mut self, address: &At<Address>, name: &str, end: &str) {
         if !self.beyond.contains(&address.place) {
             self.beyond.push(address.place.clone());

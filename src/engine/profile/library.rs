@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use include_dir::{Dir, include_dir};
 
-use crate::engine::yaml::{Faults, Source};
+use crate::engine::yaml::{Faults, Source, nearest};
 
 static SHIPPED: Dir<'static> = include_dir!("$CARGO_MANIFEST_DIR/device-profiles");
 
@@ -61,6 +61,14 @@ impl Library {
 
     pub fn contains(&self, id: &str) -> bool {
         self.files.contains_key(id)
+    }
+
+    /// What to say of an `id` that it does not contain.
+    pub fn unknown(&self, id: &str) -> String {
+        match nearest(id, &self.ids()) {
+            Some(meant) => format!("unknown profile `{id}`; did you mean `{meant}`?"),
+            None => format!("unknown profile `{id}`; `busker profiles list` lists them"),
+        }
     }
 
     /// The text of the file `id`; `None` if there is no such file, or (with a fault) no text in it.

@@ -94,6 +94,11 @@ impl Desk {
         Decision::Answer(answer(&self.topics, verb, &transaction, Status::Error, Json::Null, Some(&error)))
     }
 
+    /// The number of the bus that this device is on.
+    pub fn bus_of(&self, device: &str) -> Option<usize> {
+        self.bus_of.get(device).copied()
+    }
+
     /// The outcome of a message on a `set` topic that is for no bus: of no device, or too long to be a value.
     pub fn refusal_of_set(&self, device: &str, wanted: &str) -> Option<Outcome> {
         if !self.bus_of.contains_key(device) {

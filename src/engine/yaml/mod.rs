@@ -51,6 +51,7 @@
 //! What a value is, its type says: `off` where a text is wanted is the text `off`, and `0x10` where
 //! a number is wanted is 16. There is no guessing by YAML's own rules.
 
+mod choices;
 mod diagnostic;
 mod node;
 mod parse;
@@ -59,10 +60,11 @@ mod record;
 mod scalar;
 mod schema;
 
+pub use choices::{list_of_choices, nearest};
 pub use diagnostic::{Diagnostic, Faults, Place, Source};
 pub use node::{Content, Entry, Node};
 pub use parse::parse;
-pub use read::{At, KeySchema, Keys, Map, Read, Record, list_of_choices, nearest, read};
+pub use read::{At, KeySchema, Keys, Map, Read, Record, read};
 pub use record::{choices, record};
 pub use scalar::Scalar;
 pub use schema::{Definitions, schema_of, schema_of_choices};

@@ -4,7 +4,7 @@ use std::ops::Deref;
 
 use serde_json::{Map as JsonMap, Value as Json, json};
 
-use crate::engine::yaml::{Content, Definitions, Faults, Node, Place, Scalar};
+use crate::engine::yaml::{Content, Definitions, Faults, Node, Place, Scalar, list_of_choices};
 
 /// A type that can stand in a file.
 pub trait Read: Sized {
@@ -285,51 +285,4 @@ fn plain(field: &str) -> &str {
 
 fn one_line(documentation: &str) -> String {
     documentation.split_whitespace().collect::<Vec<_>>().join(" ")
-}
-
-/// The remedy for a wrong word: the one that was probably meant, or all that can stand here.
-pub fn list_of_choices(found: &str, choices: &[&str]) -> String {
-    if let Some(meant) = nearest(found, choices) {
-        return format!("did you mean `{meant}`?");
-    }
-    let quoted: Vec<String> = choices.iter().map(|choice| format!("`{choice}`")).collect();
-    match quoted.split_last() {
-        None => "nothing can stand here".into(),
-        Some((only, [])) => format!("expected {only}"),
-        Some((last, others)) => format!("expected {} or {last}", others.join(", ")),
-    }
-}
-
-/// The choice that differs from `found` by a slip of the fingers: one letter in three at most.
-pub fn nearest<'a>(found: &str, choices: &[&'a str]) -> Option<&'a str> {
-    let allowed = found.chars().count().max(2) / 3 + usize::from(found.chars().count() == 2);
-    let is_far = |choice: &str| found.len().abs_diff(choice.len()) > 4 * allowed;
-    choices
-        .iter()
-        .filter(|choice| !is_far(choice))
-        .map(|choice| (distance(found, choice), *choice))
-        .filter(|(distance, _)| *distance <= allowed)
-        .min_by_key(|(distance, _)| *distance)
-        .map(|(_, choice)| choice)
-}
-
-/// Letters to add, drop or change, and neighbours to swap, until `a` is `b`.
-fn distance(a: &str, b: &str) -> usize {
-    let (a, b): (Vec<char>, Vec<char>) = (a.chars().collect(), b.chars().collect());
-    let mut rows = vec![vec![0; b.len() + 1]; a.len() + 1];
-    for (i, row) in rows.iter_mut().enumerate() {
-        row[0] = i;
-    }
-    rows[0] = (0..=b.len()).collect();
-    for i in 1..=a.len() {
-        for j in 1..=b.len() {
-            let changed = usize::from(a[i - 1] != b[j - 1]);
-            let mut best = (rows[i - 1][j] + 1).min(rows[i][j - 1] + 1).min(rows[i - 1][j - 1] + changed);
-            if i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1] {
-                best = best.min(rows[i - 2][j - 2] + 1);
-            }
-            rows[i][j] = best;
-        }
-    }
-    rows[a.len()][b.len()]
 }

@@ -74,7 +74,7 @@ impl Deciders {
             if !living.iter().any(|living| living.when.iter().any(|condition| condition.point == index)) {
                 continue;
             }
-            let values = words::deciding_values(point);
+            let values = point.deciding_values();
             let ((before, behind), number) = words::around_first_number(&point.name);
             let is_sibling = |known: &&mut Deciders| {
                 let frame = words::around_first_number(&device.points[known.points[0]].name).0;

@@ -6,7 +6,7 @@ use super::{modes, points, things, words};
 use crate::engine::device::{
     Category, Device, Encoding, Identify, Platform, Point, PointIndex, Poll, WriteRule,
 };
-use crate::engine::homeassistant::{Entity, name_of_thing};
+use crate::engine::homeassistant::Entity;
 use crate::engine::wanted;
 
 /// The page, in Markdown.
@@ -45,7 +45,7 @@ impl Shown {
     fn all_of(page: &Page<'_>) -> Vec<Shown> {
         let things = page.device.things.iter().map(|thing| Shown {
             platform: thing.kind.platform(),
-            name: name_of_thing(thing),
+            name: thing.presentation.title(&thing.name),
             category: thing.presentation.category,
             is_enabled: thing.presentation.enabled.unwrap_or(true),
             is_always_there: thing.when.is_empty(),

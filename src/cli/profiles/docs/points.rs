@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use super::page::Page;
 use super::words;
 use crate::engine::address::{Address, Bits, Table};
-use crate::engine::device::{Category, Encoding, PointIndex, Unit};
+use crate::engine::device::{Category, Encoding, Form, PointIndex, Unit};
 
 /// Writes all of it.
 pub fn points(page: &Page<'_>, text: &mut String) {
@@ -247,14 +247,13 @@ impl LongTable {
 
     /// Ranges of temperatures are told in °C, also where the device can be set to another unit.
     fn about_degrees(&self, page: &Page<'_>) -> &'static str {
-        let changes = self.cases_of.iter().any(|index| match &page.device.points[*index].encoding {
-            Encoding::Plain(_) => false,
-            Encoding::Cases { cases, .. } => cases
-                .iter()
-                .filter_map(|case| case.form.as_ref())
-                .any(|form| matches!(form.unit, Unit::By(_)) && form.range.is_some()),
-        });
-        if changes { " Ranges of temperatures are given in °C." } else { "" }
+        let changes = |form: &Form| matches!(form.unit, Unit::By(_)) && form.range.is_some();
+        let mut of_cases = self.cases_of.iter().map(|index| &page.device.points[*index].encoding);
+        if of_cases.any(|encoding| encoding.forms().any(changes)) {
+            " Ranges of temperatures are given in °C."
+        } else {
+            ""
+        }
     }
 }
 

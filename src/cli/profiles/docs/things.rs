@@ -9,7 +9,6 @@ use super::words;
 use crate::engine::device::{
     Device, Kind, PRESS, Point, PointIndex, Thing, ThingKind, Write as PointWrite, WriteRule,
 };
-use crate::engine::homeassistant::name_of_thing;
 use crate::engine::topics::Topics;
 
 /// Writes the three sections, those that the device needs.
@@ -112,7 +111,7 @@ impl Told {
     }
 
     fn write(&self, page: &Page<'_>, things: &[&Thing], text: &mut String) {
-        let shown: Vec<String> = things.iter().map(|thing| name_of_thing(thing)).collect();
+        let shown: Vec<String> = things.iter().map(|thing| thing.presentation.title(&thing.name)).collect();
         let shown: Vec<&str> = shown.iter().map(String::as_str).collect();
         let names: Vec<&str> = things.iter().map(|thing| thing.name.as_str()).collect();
         let (kind, several) = words::platform(self.kind.platform());

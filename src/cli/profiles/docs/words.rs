@@ -41,7 +41,7 @@ fn settings(device: &Device, index: PointIndex) -> Vec<Vec<Option<i128>>> {
     let mut deciding: Vec<(PointIndex, Vec<i128>)> = Vec::new();
     for condition in point.when.iter().chain(touching.flat_map(|thing| &thing.when)) {
         if !deciding.iter().any(|(known, _)| *known == condition.point) {
-            let values = deciding_values(&device.points[condition.point]);
+            let values = device.points[condition.point].deciding_values();
             deciding.push((condition.point, values.into_iter().map(|(raw, _)| raw).collect()));
         }
     }
@@ -62,14 +62,6 @@ fn settings(device: &Device, index: PointIndex) -> Vec<Vec<Option<i128>>> {
         }
     }
     settings
-}
-
-/// The values by which a point can decide about others; a flag's are `OFF` and `ON`.
-pub fn deciding_values(point: &Point) -> Vec<(i128, String)> {
-    match point.plain() {
-        Some(form) if form.kind == Kind::Bool => vec![(0, "OFF".into()), (1, "ON".into())],
-        form => form.map_or(&[][..], |form| form.names.list()).to_vec(),
-    }
 }
 
 /// While what a point or a thing lives: `mode` is `direct` or `motor`, and `enabled` is `ON`.

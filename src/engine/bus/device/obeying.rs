@@ -22,7 +22,7 @@ pub(super) struct Retained {
 impl DeviceState {
     pub(in crate::engine::bus) fn target_named(&self, name: &str) -> Option<Target> {
         let device = &self.settings.device;
-        let point = device.points.iter().position(|point| point.name == name).map(Target::Point);
+        let point = device.point_named(name).map(Target::Point);
         point.or_else(|| device.things.iter().position(|thing| thing.name == name).map(Target::Thing))
     }
 

@@ -4,7 +4,6 @@
 use crate::engine::codec;
 use crate::engine::device::{Point, PointIndex, Poll, Thing, ThingKind};
 use crate::engine::health::{DeviceReport, PeriodReport, PointReport, Readout, Role, ThingReport, good_for};
-use crate::engine::homeassistant::sentence;
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::{Missing, Reading};
 
@@ -90,7 +89,7 @@ impl DeviceState {
     fn report_point(&self, index: PointIndex, point: &Point) -> PointReport {
         let told = PointReport {
             name: point.name.clone(),
-            title: point.presentation.name.clone().unwrap_or_else(|| sentence(&point.name)),
+            title: point.presentation.title(&point.name),
             role: Role::of(point),
             value: "None".into(),
             is_list: false,
@@ -155,7 +154,7 @@ impl DeviceState {
         made_of.dedup();
         ThingReport {
             name: thing.name.clone(),
-            title: thing.presentation.name.clone().unwrap_or_else(|| sentence(&thing.name)),
+            title: thing.presentation.title(&thing.name),
             kind: thing.kind.name(),
             state,
             missing,

@@ -1,7 +1,7 @@
 //! Rules of points that live in some modes only, that act by being written, or that tell events.
 
-use crate::engine::device::{Kind, Names, Poll, Unit};
-use crate::engine::profile::check::{Rules, Subject, forms};
+use crate::engine::device::{Form, Kind, Names, Poll, Unit};
+use crate::engine::profile::check::{Rules, Subject};
 
 impl Rules<'_, '_> {
     pub fn living(&mut self) {
@@ -49,11 +49,10 @@ impl Rules<'_, '_> {
     fn an_array_is_one_of_numbers_that_are_only_read(&mut self) {
         for Subject { file, point, .. } in self.entries() {
             let Some(count) = &file.count else { continue };
-            let is_number =
-                |form: &&crate::engine::device::Form| form.is_number() && form.names == Names::None;
+            let is_number = |form: &Form| form.is_number() && form.names == Names::None;
             let message = if count.value < 2 {
                 "an array of fewer than two values; expected more, or no `count`"
-            } else if point.at.bits.is_some() || !forms(point).iter().all(is_number) {
+            } else if point.at.bits.is_some() || !point.encoding.forms().all(is_number) {
                 "an array of what is no number; expected a type like `i16`, and no `values`"
             } else if point.write.is_some() {
                 "an array that is written; expected one that is only read"

@@ -226,7 +226,7 @@ impl Rules<'_, '_> {
             if expanded.is_flag {
                 continue;
             }
-            let resolved = super::forms(point);
+            let resolved: Vec<_> = point.encoding.forms().collect();
             // With cases the words of the point itself must fit one of them; `forms` are in the same order.
             let Some(first) = resolved.first() else { continue };
             let ranges: Vec<_> = resolved.iter().filter_map(|form| raw_range(point, form)).collect();
@@ -262,9 +262,8 @@ impl Rules<'_, '_> {
             if let (Encoding::Cases { by, .. }, Some(path)) = (&point.encoding, &file.by) {
                 self.check_selector(*by, path, Wanted::Names);
             }
-            let resolved = super::forms(point);
             let in_file = forms_of(file);
-            for form in &resolved {
+            for form in point.encoding.forms() {
                 if let Some(Decimals::By(selector)) = form.decimals {
                     if let Some(path) = in_file.iter().find_map(|form| digits_path(form)) {
                         self.check_selector(selector, &path, Wanted::Number);

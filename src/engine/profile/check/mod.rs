@@ -10,7 +10,7 @@ mod presentation;
 mod things;
 mod writing;
 
-use crate::engine::device::{Device, Encoding, Form, Point};
+use crate::engine::device::{Device, Form, Point};
 use crate::engine::profile::expand::Expanded;
 use crate::engine::profile::file::{self, Profile};
 use crate::engine::yaml::{At, Faults};
@@ -113,14 +113,6 @@ impl<'a, 'f> Rules<'a, 'f> {
                 }
             }
         }
-    }
-}
-
-/// Every interpretation of a point.
-fn forms(point: &Point) -> Vec<&Form> {
-    match &point.encoding {
-        Encoding::Plain(form) => vec![form],
-        Encoding::Cases { cases, .. } => cases.iter().filter_map(|case| case.form.as_ref()).collect(),
     }
 }
 

@@ -2,7 +2,7 @@
 //! Home Assistant.
 
 use crate::engine::device::{Platform, Unit};
-use crate::engine::profile::check::{Rules, forms};
+use crate::engine::profile::check::Rules;
 use crate::engine::units;
 use crate::engine::yaml::list_of_choices;
 
@@ -19,7 +19,7 @@ impl Rules<'_, '_> {
                 continue;
             };
             let point = &self.device.points[index];
-            let forms = forms(point);
+            let forms: Vec<_> = point.encoding.forms().collect();
             let Some(first) = forms.first() else { continue };
             let possible = units::platforms(point, first);
             if let Some(platform) = wish.r#as.as_ref().filter(|platform| !possible.contains(&platform.value))

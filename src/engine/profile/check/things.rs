@@ -1,6 +1,6 @@
 //! Rules of things: they are made of points that say and can be told what their rows ask for.
 
-use crate::engine::device::{Encoding, Kind, Names, Point, PointIndex, Poll, Thing, ThingKind, WriteRule};
+use crate::engine::device::{Form, Point, PointIndex, Poll, Thing, ThingKind, WriteRule};
 use crate::engine::profile::check::{Rules, taken_by_the_gateway};
 use crate::engine::profile::file;
 use crate::engine::profile::text::PointPath;
@@ -108,7 +108,8 @@ fn is_at(thing: &Thing, path: &PointPath) -> bool {
 
 /// Whether the point may ever be published as `text`.
 fn can_say(point: &Point, text: &str) -> Result<(), String> {
-    let names = names(point);
+    let named = point.plain().map(Form::named_values).unwrap_or_default();
+    let names: Vec<&str> = named.into_iter().map(|(_, name)| name).collect();
     match names.as_slice() {
         [] => Err("has no named values; expected a flag, or a point with `values`".into()),
         known if known.contains(&text) => Ok(()),
@@ -120,23 +121,12 @@ fn can_say(point: &Point, text: &str) -> Result<(), String> {
 fn can_be_told(point: &Point, text: &str) -> Result<(), String> {
     match point.write.as_ref().map(|write| &write.rule) {
         None => Err("is never written; expected a point with `write`".into()),
-        Some(WriteRule::Press { .. }) if text == "PRESS" => Ok(()),
+        Some(WriteRule::Press { .. }) if text == WriteRule::PRESS => Ok(()),
         Some(WriteRule::Press { .. }) => Err("is a button; expected `PRESS`".into()),
         Some(WriteRule::Names(allowed)) if !allowed.iter().any(|name| name == text) => {
             Err(format!("may not be set to `{text}`; expected one of its `write`"))
         }
         Some(WriteRule::Range { .. }) => Ok(()),
         Some(_) => can_say(point, text),
-    }
-}
-
-fn names(point: &Point) -> Vec<&str> {
-    match &point.encoding {
-        Encoding::Plain(form) if form.kind == Kind::Bool => vec!["OFF", "ON"],
-        Encoding::Plain(form) => match &form.names {
-            Names::All(names) | Names::Some(names) => names.iter().map(|(_, name)| name.as_str()).collect(),
-            Names::None => Vec::new(),
-        },
-        Encoding::Cases { .. } => Vec::new(),
     }
 }

@@ -122,8 +122,7 @@ impl Rules<'_, '_> {
     fn what_is_written_fits_the_value(&mut self) {
         for Subject { file, point, .. } in self.entries() {
             let (Some(write), Some(place)) = (&point.write, place_of_rule(file)) else { continue };
-            let is_moment = |form: &&Form| form.since.is_some();
-            if !point.is_button() && super::forms(point).iter().any(is_moment) {
+            if !point.is_button() && point.encoding.forms().any(|form| form.since.is_some()) {
                 self.faults.add(place, "a moment cannot be written; remove `write`");
                 continue;
             }
@@ -140,10 +139,7 @@ impl Rules<'_, '_> {
                 WriteRule::Press { .. } => {}
                 WriteRule::Any => self.any_value_is_a_clear_one(point, form, place),
                 WriteRule::Names(_) => {
-                    let known: Vec<&str> = match form.kind {
-                        Kind::Bool => vec!["OFF", "ON"],
-                        _ => form.names.list().iter().map(|(_, name)| name.as_str()).collect(),
-                    };
+                    let known: Vec<&str> = form.named_values().into_iter().map(|(_, name)| name).collect();
                     let Some(At { value: Writable::Names(in_file), .. }) = &file.write else { continue };
                     for name in in_file.iter().filter(|name| !known.contains(&name.value.as_str())) {
                         let choices = list_of_choices(&name.value, &known);

@@ -1,0 +1,214 @@
+//! What a message from the broker is to this gateway, and which of them it wants to have.
+
+use crate::engine::command::{OutcomeKind, Wish};
+use crate::engine::settings::Settings;
+use crate::engine::time::Duration;
+use crate::engine::topics::{self, Incoming, Message, ONLINE, Topics};
+
+/// A message that the broker has handed on.
+#[derive(Clone, Copy, Debug)]
+pub struct Mail<'m> {
+    pub topic: &'m str,
+    pub payload: &'m str,
+    /// It was told before anybody listened, and kept.
+    pub retained: bool,
+    /// The broker has sent it before, on an earlier connection.
+    pub repeated: bool,
+    /// How old it may be, if it was held up on its way.
+    pub stale_for: Option<Duration>,
+}
+
+/// What is to be done with it.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Arrival<'m> {
+    /// Somebody has told this gateway's state, itself perhaps.
+    OwnState,
+    /// Somebody may be below a base topic that this gateway had.
+    FormerState,
+    HomeAssistantStarted,
+    /// The broker keeps this announcement of an earlier run, or of somebody else.
+    Announcement,
+    Set {
+        device: &'m str,
+        point: &'m str,
+    },
+    /// A command that is too old to be obeyed, and why.
+    Expired {
+        reason: String,
+        outcome: Message,
+    },
+    Get {
+        device: &'m str,
+        point: &'m str,
+    },
+    /// `stale` says why it would be too old to be obeyed.
+    Request {
+        verb: &'m str,
+        stale: Option<String>,
+    },
+    Nothing,
+}
+
+/// Where messages from the broker are sorted.
+#[derive(Clone, Debug)]
+pub struct Arrivals {
+    topics: Topics,
+    former_states: Vec<String>,
+    status_topic: String,
+    filters: Vec<String>,
+}
+
+impl Arrivals {
+    /// `former_states`: where it is told whether somebody is below a base topic that this gateway had.
+    pub fn new(settings: &Settings, former_states: Vec<String>) -> Arrivals {
+        let (topics, home_assistant) = (Topics::of(&settings.mqtt), &settings.home_assistant);
+        let mut filters = topics.subscriptions();
+        filters.extend(former_states.iter().cloned());
+        if home_assistant.discovery {
+            filters.push(home_assistant.status_topic.clone());
+        }
+        // What an earlier run announced, to take away what is gone; all of it without discovery.
+        filters.push(topics::discovery(&home_assistant.prefix, "+"));
+        Arrivals { topics, former_states, status_topic: home_assistant.status_topic.clone(), filters }
+    }
+
+    /// What to subscribe to, so that everything arrives that [`Arrivals::sort`] knows.
+    pub fn filters(&self) -> &[String] {
+        &self.filters
+    }
+
+    pub fn sort<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
+        let is_news = !mail.retained;
+        if mail.topic == self.topics.bridge_state() {
+            // What the broker has kept is followed by this gateway's own word.
+            return Arrival::OwnState.only_if(is_news);
+        }
+        if self.former_states.iter().any(|state| state == mail.topic) {
+            return Arrival::FormerState;
+        }
+        if mail.topic == self.status_topic {
+            // Who was there before this connection was told everything when it was made.
+            return Arrival::HomeAssistantStarted.only_if(is_news && mail.payload == ONLINE);
+        }
+        if mail.topic.ends_with("/config") {
+            return Arrival::Announcement.only_if(mail.retained);
+        }
+        match self.topics.parse(mail.topic) {
+            Some(Incoming::Set { device, point }) => match mail.too_old().filter(|_| is_news) {
+                Some(reason) => Arrival::expired(mail, reason),
+                None => Arrival::Set { device, point },
+            },
+            Some(Incoming::Get { device, point }) => Arrival::Get { device, point }.only_if(is_news),
+            Some(Incoming::Request { verb }) => Arrival::Request { verb, stale: mail.too_old() },
+            None => Arrival::Nothing,
+        }
+    }
+}
+
+impl<'m> Arrival<'m> {
+    fn only_if(self, condition: bool) -> Arrival<'m> {
+        if condition { self } else { Arrival::Nothing }
+    }
+
+    fn expired(mail: &Mail<'m>, reason: String) -> Arrival<'m> {
+        let outcome = Wish::parse(mail.payload).ended(OutcomeKind::Expired, &reason);
+        Arrival::Expired { reason, outcome: Message::once(topics::outcome_of(mail.topic), outcome.to_json()) }
+    }
+}
+
+impl Mail<'_> {
+    fn too_old(&self) -> Option<String> {
+        match (self.repeated, self.stale_for) {
+            // A broker repeats only what it has kept from an earlier connection.
+            (true, _) => Some("the broker has kept it from an earlier connection".into()),
+            (false, Some(age)) => {
+                Some(format!("the broker or the way to it was stalled; it may be {} s old", age.as_secs()))
+            }
+            (false, None) => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::configuration;
+    use crate::engine::profile::Library;
+
+    fn arrivals(more: &str) -> Arrivals {
+        let text =
+            format!("mqtt: {{url: 'mqtt://localhost'}}\nbuses: {{cellar: {{tcp: 'host:502'}}}}\n{more}");
+        let loaded = configuration::load("busker.yaml", text.as_bytes(), &Library::shipped());
+        let settings = loaded.unwrap_or_else(|faults| panic!("{faults:?}")).0;
+        Arrivals::new(&settings, vec!["house/bridge/state".into()])
+    }
+
+    #[test]
+    fn it_is_listened_to_commands_requests_states_and_announcements() {
+        let all = [
+            "busker/+/+/set",
+            "busker/+/+/get",
+            "busker/bridge/request/+",
+            "busker/bridge/state",
+            "house/bridge/state",
+            "homeassistant/status",
+            "homeassistant/device/+/config",
+        ];
+        assert_eq!(arrivals("").filters(), all);
+        let without = arrivals("home_assistant: {discovery: false}\n");
+        assert!(without.filters().iter().eq(all.iter().filter(|filter| !filter.ends_with("/status"))));
+    }
+
+    /// `news` is what it is when it is told just now, `retained` when the broker has kept it.
+    #[track_caller]
+    fn check(topic: &str, payload: &str, news: &Arrival<'_>, retained: &Arrival<'_>) {
+        for (is_retained, expected) in [(false, news), (true, retained)] {
+            let mail = Mail { topic, payload, retained: is_retained, repeated: false, stale_for: None };
+            assert_eq!(arrivals("").sort(&mail), *expected, "{mail:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_kept_is_no_wish_of_now_and_what_is_told_now_is_no_memory() {
+        let nothing = &Arrival::Nothing;
+        check("busker/bridge/state", "offline", &Arrival::OwnState, nothing);
+        check("house/bridge/state", "online", &Arrival::FormerState, &Arrival::FormerState);
+        check("homeassistant/status", "online", &Arrival::HomeAssistantStarted, nothing);
+        check("homeassistant/status", "offline", nothing, nothing);
+        check("homeassistant/device/busker_boiler/config", "{}", nothing, &Arrival::Announcement);
+        // The bus says so of a retained one.
+        let set = &Arrival::Set { device: "boiler", point: "flow" };
+        check("busker/boiler/flow/set", "21", set, set);
+        check("busker/boiler/flow/get", "", &Arrival::Get { device: "boiler", point: "flow" }, nothing);
+        let request = &Arrival::Request { verb: "read", stale: None };
+        check("busker/bridge/request/read", "{}", request, request);
+        check("busker/boiler/flow", "21", nothing, nothing);
+        check("elsewhere", "", nothing, nothing);
+    }
+
+    #[test]
+    fn what_was_held_up_on_its_way_is_told_with_its_reason() {
+        let stalled = "the broker or the way to it was stalled; it may be 12 s old";
+        let kept = "the broker has kept it from an earlier connection";
+        let age = Some(Duration::from_millis(12_900));
+        for (repeated, stale_for, expected) in [(false, age, stalled), (true, None, kept), (true, age, kept)]
+        {
+            let mail = |topic| Mail { topic, payload: "21", retained: false, repeated, stale_for };
+            let arrivals = arrivals("");
+            let Arrival::Expired { reason, outcome } = arrivals.sort(&mail("busker/boiler/flow/set")) else {
+                panic!("it is obeyed")
+            };
+            assert_eq!(reason, expected);
+            assert_eq!((outcome.topic.as_str(), outcome.retain), ("busker/boiler/flow/outcome", false));
+            assert!(outcome.payload.contains("expired") && outcome.payload.contains(expected));
+            let request = Arrival::Request { verb: "read", stale: Some(expected.into()) };
+            assert_eq!(arrivals.sort(&mail("busker/bridge/request/read")), request);
+            // A retained one is refused for that, whenever it comes.
+            let retained = Mail { retained: true, ..mail("busker/boiler/flow/set") };
+            assert_eq!(arrivals.sort(&retained), Arrival::Set { device: "boiler", point: "flow" });
+            // Reading is never wrong.
+            let get = Arrival::Get { device: "boiler", point: "flow" };
+            assert_eq!(arrivals.sort(&mail("busker/boiler/flow/get")), get);
+        }
+    }
+}

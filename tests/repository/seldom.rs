@@ -1,0 +1,78 @@
+//! Every line of `scripts/seldom.ld` names functions that there are: a module that is called otherwise, or a crate
+//! that is used no more, would lie with all others again, and nobody would notice.
+
+use std::process::Command;
+
+#[test]
+fn every_line_of_the_linker_script_names_functions_that_there_are() {
+    let Ok(listed) = Command::new("nm").arg(env!("CARGO_BIN_EXE_busker")).output() else {
+        eprintln!("no nm here: the linker script is not held against the program");
+        return;
+    };
+    assert!(listed.status.success(), "{}", String::from_utf8_lossy(&listed.stderr));
+    let listed = String::from_utf8(listed.stdout).expect("the names of functions are text");
+    let functions: Vec<&str> = listed.lines().filter_map(|line| line.split_whitespace().last()).collect();
+    let script = super::read("scripts/seldom.ld");
+    let lines: Vec<&str> = script
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("*(")?.strip_suffix(')'))
+        .filter(|patterns| patterns.starts_with(".text."))
+        .collect();
+    assert!(lines.len() > 40, "only {} lines were found", lines.len());
+    let names_nothing = |line: &&str| {
+        let mut patterns = line.split(' ').map(|pattern| {
+            let function = pattern.strip_prefix(".text.");
+            function.unwrap_or_else(|| panic!("`{pattern}` is no section of a function"))
+        });
+        !patterns.any(|pattern| functions.iter().any(|function| fits(pattern, function)))
+    };
+    let nothing: Vec<&str> = lines.into_iter().filter(names_nothing).collect();
+    assert!(nothing.is_empty(), "scripts/seldom.ld names functions that there are none of: {nothing:#?}");
+}
+
+/// Whether the linker takes `name` for one that `pattern` means: `*`, `?`, and `[!x]` for any letter but that.
+fn fits(pattern: &str, name: &str) -> bool {
+    let mut rest = pattern.chars();
+    match rest.next() {
+        None => name.is_empty(),
+        Some('*') => {
+            let rest = rest.as_str();
+            let literal = rest.split(['*', '?', '[']).next().unwrap_or_default();
+            rest.is_empty() || name.match_indices(literal).any(|(at, _)| fits(rest, &name[at..]))
+        }
+        Some(wanted) => {
+            let mut letters = name.chars();
+            let Some(found) = letters.next() else { return false };
+            let is_fit = match wanted {
+                '?' => true,
+                '[' => {
+                    let (unwanted, behind) = rest
+                        .as_str()
+                        .strip_prefix('!')
+                        .and_then(|inside| inside.split_once(']'))
+                        .expect("only `[!x]` is used");
+                    rest = behind.chars();
+                    !unwanted.contains(found)
+                }
+                letter => letter == found,
+            };
+            is_fit && fits(rest.as_str(), letters.as_str())
+        }
+    }
+}
+
+#[test]
+fn a_pattern_is_understood_as_the_linker_does() {
+    for (pattern, name, expected) in [
+        ("_ZN5hyper*", "_ZN5hyper4body", true),
+        ("_ZN5hyper*", "_ZN10hyper_util", false),
+        ("_ZN*_$LT$hyper..*", "_ZN59_$LT$hyper..body", true),
+        ("_ZN*_$LT$hyper..*", "_ZN59_$LT$hyper_util..body", false),
+        ("reload[!1]*", "reload7compare", true),
+        ("reload[!1]*", "reload17topics_of_devices", false),
+        ("_5gimli?*", "_5gimli", false),
+        ("_5gimli?*", "_5gimli4read", true),
+    ] {
+        assert_eq!(fits(pattern, name), expected, "{pattern} {name}");
+    }
+}
