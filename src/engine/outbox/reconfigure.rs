@@ -60,7 +60,8 @@ impl Outbox {
         let is_told = self.is_empty()
             && self.formers.is_empty()
             && self.remembered.is_empty()
-            && self.states_due_at.is_none();
+            && self.states_due_at.is_none()
+            && self.held.is_empty();
         let own = self.own_devices.iter();
         let told = own.filter_map(|topic| {
             let entry = self.retained.get(topic.as_str())?;
