@@ -2,7 +2,7 @@
 
 use crate::engine::configuration::file::PointWish;
 use crate::engine::device::{
-    self, Condition, Device, Encoding, Form, Kind, Point, PointIndex, Poll, Thing, Unit,
+    self, Condition, Device, Encoding, Form, Kind, Platform, Point, PointIndex, Poll, Thing, Unit,
 };
 use crate::engine::profile::file;
 use crate::engine::units::{self, Release};
@@ -278,6 +278,10 @@ fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults, warn
         };
         let (class, state) =
             (point.presentation.device_class.as_deref(), point.presentation.state_class.as_deref());
+        // The class that the unit stands for, where none is wished.
+        let is_numeric = matches!(platform, Platform::Sensor | Platform::Number);
+        let of_unit = || units::class_of_unit(unit?, form.difference).filter(|_| is_numeric);
+        let class = class.or_else(of_unit);
         let fits = units::check(platform, class, unit, state);
         let fits = fits.and_then(|()| units::check_sense(platform, form, class, state));
         if let (Some(place), Err(message)) = (place, fits) {
