@@ -5,6 +5,7 @@
 mod claim;
 mod farewells;
 mod former;
+mod held;
 mod manner;
 mod pace;
 mod queue;
@@ -23,6 +24,7 @@ use crate::engine::topics::{self, Kind, Message, OFFLINE, ONLINE, Topics};
 use claim::Claim;
 use former::Former;
 pub use former::Tree;
+use held::Held;
 use pace::Pace;
 use queue::{Lane, Queue, Queued};
 use taken_back::TakenBack;
@@ -59,6 +61,7 @@ pub struct Outbox {
     is_left_to_others: bool,
     formers_due: Option<Time>,
     claim: Claim,
+    held: Held,
     retained: BTreeMap<Arc<str>, Retained>,
     queue: Queue,
     pace: Pace,
@@ -103,6 +106,7 @@ impl Outbox {
             is_left_to_others: false,
             formers_due: None,
             claim: Claim::default(),
+            held: Held::default(),
             retained: BTreeMap::new(),
             queue: Queue::default(),
             pace: Pace::default(),
@@ -136,6 +140,9 @@ impl Outbox {
             self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
             self.tells_once_more = true;
         }
+        if message.retain && message.topic.starts_with(&self.discovery_prefix) {
+            self.held.is_announced(now);
+        }
         self.pace.told(self.is_answer(&message));
         self.taken_back.handed_over(&message.topic, now);
         Some(message)
@@ -163,7 +170,8 @@ impl Outbox {
                         if self.too_long.is(entry.payload.len()) {
                             continue;
                         }
-                        return Some(Message::retained(&*topic, entry.payload.clone()));
+                        let payload = self.held.told_instead(&topic).unwrap_or(&entry.payload);
+                        return Some(Message::retained(&*topic, payload));
                     }
                 }
             }
@@ -233,6 +241,7 @@ impl Outbox {
         removals.into_iter().for_each(|topic| self.queue_last(Queued::Removal(topic)));
         last.into_iter().for_each(|topic| self.queue_last(Queued::Newest(topic)));
         self.retained.values_mut().for_each(|entry| entry.queued = true);
+        self.tell_held_first();
         self.states_due_at = None;
     }
 
@@ -254,7 +263,12 @@ impl Outbox {
     /// When [`Outbox::wake`] or [`Outbox::next_message`] has something to do.
     pub fn wake_at(&self) -> Option<Time> {
         let held_until = self.pace.held_until().filter(|_| !self.is_empty());
-        let due = self.states_due_at.into_iter().chain(self.formers_due).chain(self.claim.due());
+        let due = self
+            .states_due_at
+            .into_iter()
+            .chain(self.formers_due)
+            .chain(self.claim.due())
+            .chain(self.held.due());
         due.chain(held_until).min()
     }
 
@@ -262,6 +276,7 @@ impl Outbox {
     pub fn wake(&mut self, now: Time) {
         self.wake_claim(now);
         self.wake_formers(now);
+        self.wake_held(now);
         if self.states_due_at.is_some_and(|due| due <= now) {
             let once_more = std::mem::take(&mut self.tells_once_more);
             self.states_due_at = once_more.then(|| now + STATES_ONCE_MORE);
@@ -293,9 +308,12 @@ impl Outbox {
         // It is kept, and text that was written bit by bit has room for as much again.
         message.payload.shrink_to_fit();
         if let Some(entry) = self.retained.get_mut(&*message.topic) {
-            entry.payload = message.payload;
+            let before = std::mem::replace(&mut entry.payload, message.payload);
             if !std::mem::replace(&mut entry.queued, true) {
                 self.queue_last(Queued::Newest(message.topic.as_str().into()));
+            }
+            if message.topic.starts_with(&self.discovery_prefix) {
+                self.hold_back(&message.topic, &before);
             }
         } else {
             let topic: Arc<str> = message.topic.as_str().into();

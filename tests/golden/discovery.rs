@@ -120,7 +120,6 @@ fn payload(device: &Device, known: &[Option<i128>]) -> Value {
         topics: Topics::new("busker"),
         prefix: "homeassistant".into(),
         release: Release::USUAL,
-        retains: true,
         expire_after: None,
     };
     let settings = DeviceSettings {

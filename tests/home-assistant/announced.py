@@ -89,7 +89,7 @@ class Announced:
             }
         payload = self.payload()
         if payload is None:
-            return {"state": "unknown"}
+            return {"state": "" if self.platform == "text" else "unknown"}
         if self.platform in ("switch", "binary_sensor"):
             return {"state": "on" if payload == self.component.get("payload_on", "ON") else "off"}
         if self.platform in ("cover", "valve"):

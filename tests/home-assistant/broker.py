@@ -1,6 +1,7 @@
 """A real mosquitto, and ears at it."""
 
 import contextlib
+import math
 import pathlib
 import signal
 import socket
@@ -27,6 +28,8 @@ class Broker:
             "set_tcp_nodelay true\n"
         )
         self.ending = ending
+        # From when to when it was away, by the clock on the wall.
+        self.absences: list[list[float]] = []
         self.start()
 
     def start(self) -> None:
@@ -34,8 +37,11 @@ class Broker:
         self.process = subprocess.Popen(["mosquitto", "-c", str(self.settings)], stdout=nowhere, stderr=nowhere)
         self.ending.callback(self.process.kill)
         wait_for_port(self.port)
+        if self.absences:
+            self.absences[-1][1] = time.time()
 
     def stop(self, forget: bool) -> None:
+        self.absences.append([time.time(), math.inf])
         self.process.send_signal(signal.SIGTERM)
         self.process.wait(PATIENCE)
         if forget:
@@ -52,8 +58,13 @@ class Broker:
             time.sleep(0.02)
 
     def kill(self) -> None:
+        self.absences.append([time.time(), math.inf])
         self.process.kill()
         self.process.wait(PATIENCE)
+
+    def was_away(self, at: float, behind: float) -> bool:
+        """Whether it was away at this time, or not long before it."""
+        return any(since <= at <= until + behind for since, until in self.absences)
 
     def publish(self, messages: dict[str, str]) -> None:
         """As somebody else, retained; an empty text takes a message back."""

@@ -40,8 +40,8 @@ def main() -> None:
                 step(house)
                 print(f"  ({time.monotonic() - since:.0f} s)", flush=True)
         except Fault:
-            # What the gateway itself says about it, for whoever has to find out.
-            print(house.gateway.log(), file=sys.stderr)
+            # What both themselves say about it, for whoever has to find out.
+            print(house.gateway.log(), *(line for _, line in house.home.log()[-20:]), sep="\n", file=sys.stderr)
             raise
     if only:
         return

@@ -6,7 +6,7 @@ import signal
 import subprocess
 
 from broker import Broker
-from fault import PATIENCE, Fault
+from fault import PATIENCE, Deadline, Fault
 
 # Profiles of the test's own, for what no shipped one has.
 OWN_PROFILES = pathlib.Path(__file__).parent / "profiles"
@@ -54,7 +54,7 @@ class Gateway:
             "buses": buses,
             "devices": {
                 device.name: {"profile": device.profile, "bus": device.line.name, "unit": device.unit,
-                              "name": device.title}
+                              "name": device.title, **device.wishes}
                 for device in self.devices
             },
         }
@@ -65,7 +65,11 @@ class Gateway:
     def reload(self) -> None:
         """Takes the configuration as it is now, and goes on."""
         self.configure()
+        done = "what has changed is at work"
+        before, deadline = self.log().count(done), Deadline(f"the gateway logs that {done}")
         self.process.send_signal(signal.SIGHUP)
+        while self.log().count(done) == before:
+            deadline.pass_by()
 
     def start(self) -> None:
         configuration = self.configure()

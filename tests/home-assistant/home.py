@@ -16,6 +16,7 @@ class Home:
 
     def __init__(self, folder: pathlib.Path, broker_port: int, ending: contextlib.ExitStack) -> None:
         self.command = [sys.executable, str(HERE / "probe.py"), str(folder), str(broker_port)]
+        self.warnings = folder / "warnings"
         self.start()
         ending.callback(lambda: self.process.kill())
 
@@ -39,6 +40,10 @@ class Home:
     def ask(self, do: str, **more):
         self.process.stdin.write(json.dumps({"do": do, **more}) + "\n")
         return self.answer()
+
+    def log(self) -> list[tuple[float, str]]:
+        """What it has logged as a warning or worse since the first start, and when, by the clock on the wall."""
+        return [tuple(json.loads(line)) for line in self.warnings.read_text().splitlines()]
 
     def wait(self, wanted: dict, seconds: float = PATIENCE) -> None:
         self.ask("wait", **{"for": wanted}, seconds=seconds)

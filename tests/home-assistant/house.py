@@ -4,8 +4,10 @@ import contextlib
 import json
 import pathlib
 import re
+import shutil
 import time
 
+import rules
 from announced import Announced, announced
 from broker import Broker, broker_version
 from calls import IS_NOT_KEPT, Call, as_it_was, in_turns
@@ -21,14 +23,21 @@ NEWEST = "2026.11"
 # With 3,000 points on a machine that has other things to do, too.
 LONG_PATIENCE = 120
 
-# What Home Assistant and its MQTT client may say themselves when their broker goes, and while it is away.
+# What Home Assistant and its MQTT client say themselves when their broker goes and while it is away, and only then.
+# It gathers subscriptions for some tenths of a second; those that wait when the broker goes end in
+# `mqtt_broker_error`, in plain words if it has its translations by then.
 BROKER_IS_AWAY = re.compile(
     r".*("
     r"mqtt\.client: Error returned from MQTT server: The connection was lost\."
     r"|paho\.mqtt\.client: failed to receive on socket: \[Errno \d+\] (Connection reset by peer|Broken pipe)"
     r"|mqtt\.client: Failed to connect to MQTT server due to exception: \[Errno 111\] Connection refused"
+    r"|ERROR homeassistant\.components\.mqtt\.util: (mqtt_broker_error|Error talking to MQTT: The client is not currently connected\.)"
     r")"
 )
+# Its thread may say so a little later.
+A_LITTLE = 1
+# What it had asked for when the broker went is not answered; it says so after ten seconds.
+NEVER_ANSWERED = re.compile(r".*mqtt\.client: No ACK from MQTT server in 10 seconds .*")
 
 # 2025.4 clears the topic of a removed device once more for each of its disabled entities, and then wonders itself.
 CLEARS_TWICE = re.compile(r"WARNING homeassistant\.components\.mqtt\.discovery: No device components to cleanup for .*")
@@ -36,7 +45,6 @@ CLEARS_TWICE = re.compile(r"WARNING homeassistant\.components\.mqtt\.discovery: 
 # On a machine with too much to do Home Assistant may complain of its own slowness.
 IS_SLOW = re.compile(
     r".* took \d+\.\d+ seconds\. Please create a bug report .*|.* is taking over \d+ seconds\."
-    r"|.*mqtt\.client: No ACK from MQTT server in 10 seconds .*"
 )
 
 
@@ -47,8 +55,9 @@ class House:
         self, program: str, version: str, folder: pathlib.Path, ending: contextlib.ExitStack, planted=plant,
         own_profiles: pathlib.Path = OWN_PROFILES, knows_all: bool = False,
     ) -> None:
-        self.program, self.version, self.folder = program, version, folder
-        self.busker = Busker(program, own_profiles)
+        self.program, self.version, self.folder, self.ending = program, version, folder, ending
+        # A copy, which steps may change.
+        self.busker = Busker(program, shutil.copytree(own_profiles, folder / "profiles"))
         self.devices = planted(self.busker, folder, ending)
         self.by_identity = {device.identity: device for device in self.devices}
         self.broker = Broker(folder, ending)
@@ -116,11 +125,17 @@ class House:
             # An older Home Assistant never lets go of a disabled entity but with its device.
             registered = {key: one for key, one in registered.items() if one["enabled"] or key in all_announced}
         same(set(registered), set(all_announced), "the entities in the registry")
+        rules.are_kept(all_announced, registered, self.home.ask("devices"), set(self.own_ids))
         for one in all_announced.values():
             device = self.by_identity.get(one.identity)
             # A device that gets another key in the configuration is no other one here.
             self.report.saw(device and device.profile, one.kind, one.unique_id.removeprefix(one.identity if device else ""))
         return all_announced
+
+    def is_told(self) -> None:
+        """Waits until the broker holds all that busker has to say to it of its devices, whoever listens."""
+        for device in self.gateway.devices:
+            self.announced_in_the_end(device.identity)
 
     def facts(self, all_announced: dict[str, Announced], fresh: bool) -> dict[str, dict]:
         """What Home Assistant should have and show."""
@@ -151,11 +166,24 @@ class House:
         return count
 
     def log_is_empty(self) -> None:
-        let_pass = [BROKER_IS_AWAY, IS_SLOW]
-        if self.version != NEWEST:
-            let_pass.append(CLEARS_TWICE)
-        log = [line for line in self.home.ask("log") if not any(one.fullmatch(line) for one in let_pass)]
+        """But for what Home Assistant says of its broker and its machine, and of itself."""
+        reasons = [(self.reason(at, line), line) for at, line in self.home.log()]
+        log = [line for reason, line in reasons if reason is None] + self.home.ask("issues")
         same(log, [], "Home Assistant's log")
+        same([line for line in self.gateway.log().splitlines() if " ERROR " in line or "panicked" in line], [], "busker's own log")
+        self.report.let_pass[self.folder] = [reason for reason, _ in reasons]
+
+    def reason(self, at: float, line: str) -> str | None:
+        """Why this line of Home Assistant's log is nothing that busker has to do with; `None`: it may be."""
+        if BROKER_IS_AWAY.fullmatch(line) and self.broker.was_away(at, A_LITTLE):
+            return "the broker that is away"
+        if NEVER_ANSWERED.fullmatch(line) and self.broker.was_away(at, 10 + A_LITTLE):
+            return "the broker that is away"
+        if IS_SLOW.fullmatch(line) or NEVER_ANSWERED.fullmatch(line):
+            return "a slow machine"
+        if self.version != NEWEST and CLEARS_TWICE.fullmatch(line):
+            return "its own second clearing"
+        return None
 
     def act(self, calls: list["Call"]) -> set[str]:
         """Calls services, waits until busker says how each ended, and until Home Assistant shows what it

@@ -23,6 +23,8 @@ class Device:
         self.profile, self.unit, self.line = about["device"], unit, line
         self.manufacturer, self.model = about["manufacturer"], about["model"]
         self.name = re.sub("[^a-z0-9]", "_", self.profile)
+        # What the configuration says of it beside profile, bus and unit.
+        self.wishes: dict = {}
         self.title = f"{self.manufacturer} {self.model}"
         self.identity = f"busker_{self.name}"
         self.points = {point["name"]: point for point in description["points"]}

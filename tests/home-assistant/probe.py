@@ -19,8 +19,11 @@ standard input is a command with a `do`; each gets one line of answer on standar
                                           as a user gives an entity his own name and id
     {"do": "services"}                    the services of each domain that the MQTT entities have
     {"do": "classes"}                     Home Assistant's own tables of device classes, units and state classes
-    {"do": "log"}                         what was logged as a warning or worse, and open repair issues
+    {"do": "issues"}                      the open repair issues
     {"do": "quit"}
+
+What Home Assistant logs as a warning or worse stands in FOLDER/warnings, a line of JSON for each with the time: also
+what it says while it starts and ends.
 """
 
 import asyncio
@@ -53,18 +56,20 @@ mqtt_client.RECONNECT_INTERVAL_SECONDS = 1
 class Warnings(logging.Handler):
     """Keeps what Home Assistant would show a user in its log."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: pathlib.Path) -> None:
         super().__init__(logging.WARNING)
+        self.file = (folder / "warnings").open("a", buffering=1)
         self.lines: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
         fault = f" ({record.exc_info[1]!r})" if record.exc_info else ""
         self.lines.append(f"{record.levelname} {record.name}: {record.getMessage()}{fault}")
+        self.file.write(json.dumps([record.created, self.lines[-1]]) + "\n")
 
 
 class Probe:
-    def __init__(self, hass: core.HomeAssistant, warnings: Warnings) -> None:
-        self.hass, self.warnings = hass, warnings
+    def __init__(self, hass: core.HomeAssistant) -> None:
+        self.hass = hass
         self.changed = asyncio.Event()
         hass.bus.async_listen(EVENT_STATE_CHANGED, self.notice)
         hass.bus.async_listen(entity_registry.EVENT_ENTITY_REGISTRY_UPDATED, self.notice)
@@ -90,6 +95,10 @@ class Probe:
         device = device_registry.async_get(self.hass).async_get(entry.device_id)
         return {
             "entity_id": entry.entity_id,
+            # By which Home Assistant keeps all that it knows of them, histories too.
+            "entry": entry.id,
+            "device_entry": entry.device_id,
+            "friendly_name": attributes.get("friendly_name"),
             "platform": entry.domain,
             "name": entry.name or entry.original_name,
             "device": next(iter(device.identifiers))[1] if device else None,
@@ -193,9 +202,9 @@ class Probe:
             "switch": [str(one) for one in switch.SwitchDeviceClass],
         }
 
-    async def log(self, _: dict) -> list[str]:
+    async def issues(self, _: dict) -> list[str]:
         issues = issue_registry.async_get(self.hass).issues.values()
-        return self.warnings.lines + [f"issue {issue.issue_id}" for issue in issues if issue.active]
+        return [f"issue {issue.issue_id}" for issue in issues if issue.active]
 
     async def serve(self, commands: asyncio.StreamReader) -> None:
         while line := await commands.readline():
@@ -246,7 +255,7 @@ def prepare(folder: pathlib.Path, broker_port: int) -> None:
 
 async def main(folder: pathlib.Path, broker_port: int) -> None:
     prepare(folder, broker_port)
-    warnings = Warnings()
+    warnings = Warnings(folder)
     logging.getLogger().addHandler(warnings)
 
     hass = core.HomeAssistant(str(folder))
@@ -260,7 +269,7 @@ async def main(folder: pathlib.Path, broker_port: int) -> None:
     if await bootstrap.async_from_config_dict({"homeassistant": CORE}, hass) is None:
         tell({"failed": "; ".join(warnings.lines) or "Home Assistant did not start"})
         return
-    probe = Probe(hass, warnings)
+    probe = Probe(hass)
     await hass.async_start()
     tell({"is": {"home_assistant": __version__, "python": sys.version.split()[0]}})
 

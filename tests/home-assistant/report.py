@@ -16,6 +16,8 @@ class Report:
         self.made: dict = collections.defaultdict(set)
         self.services: dict = collections.Counter()
         self.rows: list[tuple[str, str]] = []
+        # Why lines of Home Assistant's log were let pass, by the house that they are of.
+        self.let_pass: dict[object, list[str]] = {}
 
     def saw(self, device: str | None, kind: str, unique_id: str) -> None:
         self.made[device, kind].add(unique_id)
@@ -27,12 +29,17 @@ class Report:
     def markdown(self, in_short: bool) -> str:
         about = self.about
         lines = [
-            f"Seen with Home Assistant {about['home_assistant']} on Python {about['python']}, {about['broker']}.",
+            f"Seen with Home Assistant {about['home_assistant']} on Python {about['python']}, {about['broker']}. Lines of its log "
+            f"that were let pass: {self.passed() or 'none'}.",
             "",
             *table(("what", "seen"), self.rows),
             "",
         ]
         return "\n".join(lines if in_short else lines + self.counts())
+
+    def passed(self) -> str:
+        counts = collections.Counter(reason for reasons in self.let_pass.values() for reason in reasons)
+        return ", ".join(f"{count} about {reason}" for reason, count in sorted(counts.items()))
 
     def counts(self) -> list[str]:
         return [

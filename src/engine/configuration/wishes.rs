@@ -1,7 +1,9 @@
 //! What the owner of a device wishes for single points of its profile.
 
 use crate::engine::configuration::file::PointWish;
-use crate::engine::device::{self, Condition, Device, Encoding, Point, PointIndex, Poll, Thing, Unit};
+use crate::engine::device::{
+    self, Condition, Device, Encoding, Platform, Point, PointIndex, Poll, Thing, Unit,
+};
 use crate::engine::profile::file;
 use crate::engine::units::{self, Release};
 use crate::engine::yaml::{At, Faults, Map, Node, Place, list_of_choices, nearest, read};
@@ -272,6 +274,10 @@ fn check_presentation(point: &Point, wish: &PointWish, faults: &mut Faults, warn
         };
         let (class, state) =
             (point.presentation.device_class.as_deref(), point.presentation.state_class.as_deref());
+        // The class that the unit stands for, where none is wished.
+        let is_numeric = matches!(platform, Platform::Sensor | Platform::Number);
+        let of_unit = || units::class_of_unit(unit?, form.difference).filter(|_| is_numeric);
+        let class = class.or_else(of_unit);
         let fits = units::check(platform, class, unit, state);
         let fits = fits.and_then(|()| units::check_sense(platform, form, class, state));
         if let (Some(place), Err(message)) = (place, fits) {

@@ -19,8 +19,6 @@ pub struct Gateway {
     pub prefix: String,
     /// The oldest that must understand it.
     pub release: Release,
-    /// Whether the broker keeps values.
-    pub retains: bool,
     /// After this what tells nothing is unavailable; `None`: never.
     pub expire_after: Option<Duration>,
 }
@@ -31,7 +29,6 @@ impl Gateway {
             topics: Topics::of(mqtt),
             prefix: home_assistant.prefix.clone(),
             release: home_assistant.minimum_version,
-            retains: mqtt.values.retain,
             expire_after: home_assistant.expire_after,
         }
     }
@@ -125,9 +122,29 @@ impl Announcement {
         let availability = self.head.get("availability").and_then(Value::as_array).into_iter().flatten();
         let availability = availability.filter_map(|entry| entry.get("topic"));
         let keys = self.components.iter().flat_map(|(_, component)| component);
-        let is_told = |key: &str| key.ends_with("_topic") && !key.ends_with("command_topic");
         let told = keys.filter(|(key, _)| is_told(key)).map(|(_, topic)| topic);
         availability.chain(told).filter_map(Value::as_str).collect()
+    }
+
+    /// The topics of which this one makes something else than `previous` did.
+    pub fn told_otherwise_than(&self, previous: &Announcement) -> BTreeSet<String> {
+        let before = previous.meanings();
+        let now = self.meanings().into_iter();
+        let changed = now.filter(|(topic, now)| before.get(topic).is_some_and(|before| before != now));
+        changed.map(|(topic, _)| topic.to_string()).collect()
+    }
+
+    /// What stands on each topic: for which components, and what decides there which values are right.
+    fn meanings(&self) -> BTreeMap<&str, Vec<Meaning<'_>>> {
+        let mut meanings: BTreeMap<&str, Vec<Meaning>> = BTreeMap::new();
+        for (key, component) in &self.components {
+            let topics = component.iter().filter(|(key, _)| is_told(key));
+            for topic in topics.filter_map(|(_, topic)| topic.as_str()) {
+                let meaning = MEANING.map(|key| component.get(key));
+                meanings.entry(topic).or_default().push((key.as_str(), meaning));
+            }
+        }
+        meanings
     }
 
     /// Nothing to announce: such a device is better not mentioned at all, since Home Assistant takes
@@ -155,6 +172,27 @@ impl Announcement {
         payload.insert("components".into(), components.into());
         Value::Object(payload).to_string()
     }
+}
+
+/// What decides of a component which values are right for it: Home Assistant logs a warning for a name that is no
+/// option, and for a number that is to be a moment.
+const MEANING: [&str; 8] = [
+    "platform",
+    "device_class",
+    "unit_of_measurement",
+    "state_class",
+    "suggested_display_precision",
+    "options",
+    "modes",
+    "temperature_unit",
+];
+
+/// A component's key, and what stands in it of [`MEANING`].
+type Meaning<'a> = (&'a str, [Option<&'a Value>; MEANING.len()]);
+
+/// Whether under this key of a component stands a topic on which something is told.
+fn is_told(key: &str) -> bool {
+    key.ends_with("_topic") && !key.ends_with("command_topic")
 }
 
 /// What is kept of an announcement that was made: taken apart it is eight times as large as its text, and

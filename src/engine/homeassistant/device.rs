@@ -34,7 +34,7 @@ pub fn announcement(
             component.extend(expiry.map(|seconds| ("expire_after".into(), seconds.into())));
             let is_no_number =
                 matches!(entity.device_class.as_deref(), Some("enum" | "timestamp" | "uptime"));
-            if !gateway.retains && is_no_number {
+            if is_no_number {
                 component.insert("value_template".into(), NOTHING_IS_NONE.into());
             }
             components.push((entity.key.clone(), component));
@@ -50,7 +50,7 @@ pub fn announcement(
     }
     for thing in &device.device.things {
         if let Some(mut component) = thing_component(&identity, own, device, thing, known) {
-            if !gateway.retains && thing.kind == ThingKind::Climate {
+            if thing.kind == ThingKind::Climate {
                 component.insert("mode_state_template".into(), NOTHING_IS_NONE.into());
             }
             components.push((thing.name.clone(), component));
@@ -97,8 +97,8 @@ fn diagnostics(gateway: &Gateway, identity: &str, own: &DeviceTopics, device: &D
     components
 }
 
-/// What the broker keeps of an earlier run is taken back with an empty message, if nothing is to be kept. Home
-/// Assistant passes over it for most, and warns of it where there are names or moments: of enumerations, of a climate's
+/// What the broker keeps is taken back with an empty message, where nothing is to be kept, and of a point that is
+/// gone before Home Assistant has let go of its entity. Home Assistant passes over it for most, and warns of it where there are names or moments: of enumerations, of a climate's
 /// modes, of timestamps.
 const NOTHING_IS_NONE: &str = "{{ value or none }}";
 
@@ -155,7 +155,11 @@ pub(super) fn name_beside(name: &str, title: &str) -> Value {
     let begins_so = name.get(..title.len()).is_some_and(|start| start.eq_ignore_ascii_case(title));
     match name.get(title.len()..) {
         Some("") if begins_so => Value::Null,
-        Some(rest) if begins_so && rest.starts_with(' ') => sentence(rest.trim()).into(),
+        Some(rest) if begins_so && rest.starts_with([' ', ':', ',']) => {
+            // `Heating: flow`, `Heating – flow`.
+            let beside = |c: char| c.is_whitespace() || matches!(c, ':' | ',' | '-' | '–');
+            Some(sentence(rest.trim_matches(beside))).filter(|rest| !rest.is_empty()).into()
+        }
         _ => name.into(),
     }
 }
@@ -166,4 +170,28 @@ fn without_empty(mut value: Value) -> Value {
         map.retain(|_, value| value.as_str() != Some(""));
     }
     value
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_device_is_not_named_twice() {
+        for (name, expected) in [
+            ("Flow", Some("Flow")),
+            ("Büro", None),
+            ("büro", None),
+            ("Büro:", None),
+            ("Büro flow", Some("Flow")),
+            ("BÜRO flow", Some("BÜRO flow")),
+            ("Büro: Übergabe", Some("Übergabe")),
+            ("Büro – flow", Some("Flow")),
+            ("Büro-Nord", Some("Büro-Nord")),
+            ("Bürofläche", Some("Bürofläche")),
+            ("B", Some("B")),
+        ] {
+            assert_eq!(name_beside(name, "Büro").as_str(), expected, "{name}");
+        }
+    }
 }

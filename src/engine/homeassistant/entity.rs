@@ -31,6 +31,8 @@ pub struct Entity {
     pub min: Option<Decimal>,
     pub max: Option<Decimal>,
     pub step: Option<Decimal>,
+    /// Of a number without limits of its own: how far from zero it may be.
+    pub reach: f64,
     /// The most characters of a text.
     pub length: Option<u16>,
     /// The text that a button sends.
@@ -60,6 +62,7 @@ impl Entity {
             min: None,
             max: None,
             step: None,
+            reach: FARTHEST_F32,
             length: None,
             press: None,
             value_template: None,
@@ -105,8 +108,8 @@ impl Entity {
         put("event_types", (!self.event_types.is_empty()).then(|| self.event_types.clone().into()));
         if self.platform == Platform::Number {
             // Home Assistant's own limits are 0 and 100, and its finest step is 0.001.
-            put("min", Some(self.min.map_or_else(|| json!(f64::from(f32::MIN)), number)));
-            put("max", Some(self.max.map_or_else(|| json!(f64::from(f32::MAX)), number)));
+            put("min", Some(self.min.map_or_else(|| json!(-self.reach), number)));
+            put("max", Some(self.max.map_or_else(|| json!(self.reach), number)));
             let finest = Decimal { units: 1, decimals: 3 };
             let step = self.step.filter(|step| step.compare(finest).is_gt()).unwrap_or(finest);
             put("step", Some(number(step)));
@@ -119,6 +122,10 @@ impl Entity {
         component
     }
 }
+
+/// Beyond the largest number of a four-byte float. The digits in which that is published round it up, and Home
+/// Assistant logs an error for a number beyond its limits.
+const FARTHEST_F32: f64 = 3.4028236e38;
 
 /// A whole number without a dot, since `0.0` as a limit would look odd beside `20`.
 fn number(decimal: Decimal) -> Value {

@@ -58,10 +58,15 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
                 Kind::LetterNumber => 4,
                 _ => 10,
             });
+            entity.value_template = Some(NO_TEXT_IS_EMPTY.into());
         }
     }
     Some(entity)
 }
+
+/// A text is the one entity for which Home Assistant has no word that means unknown: it would show `None` itself,
+/// as if that stood in the device.
+const NO_TEXT_IS_EMPTY: &str = "{{ '' if value == 'None' else value }}";
 
 /// Whether enough is known to say which entities there are: no point waits for another one.
 pub fn is_settled(device: &Device, known: &[Option<i128>]) -> bool {
@@ -105,6 +110,9 @@ fn describe_number(entity: &mut Entity, point: &Point, resolved: &Resolved) {
         let of_a_float = || resolved.form.kind.is_float().then(|| units::digits_of_a_float(unit.as_deref()));
         entity.precision = resolved.display_precision().or_else(of_a_float);
     } else {
+        if resolved.form.kind == Kind::F64 {
+            entity.reach = f64::MAX;
+        }
         let limits = point.write.as_ref().and_then(|write| codec::limits(resolved, &write.rule));
         if let Some(limits) = limits {
             let limits = with_factory_setting(point, resolved, limits);
@@ -403,8 +411,16 @@ mod tests {
             &["button flow_value: device_class=restart payload_press=PRESS"],
         );
         check_entity(
+            point_with(Form::new(Kind::F32), Some(WriteRule::Any), NOTHING),
+            &["number flow_value: min=-3.4028236e+38 max=3.4028236e+38 step=0.001"],
+        );
+        check_entity(
+            point_with(Form::new(Kind::F64), Some(WriteRule::Any), NOTHING),
+            &["number flow_value: min=-1.7976931348623157e+308 max=1.7976931348623157e+308 step=0.001"],
+        );
+        check_entity(
             point_with(Form::new(Kind::Text { registers: 4 }), Some(WriteRule::Any), NOTHING),
-            &["text flow_value: max=8"],
+            &["text flow_value: max=8 value_template={{ '' if value == 'None' else value }}"],
         );
     }
 

@@ -20,7 +20,6 @@ fn gateway() -> Gateway {
         topics: Topics::new("busker"),
         prefix: "homeassistant".into(),
         release: Release::USUAL,
-        retains: true,
         expire_after: None,
     }
 }
@@ -154,14 +153,9 @@ fn an_empty_message_which_takes_a_value_back_is_none_of_an_enumerations_names() 
     let names = Names::All(vec![(0, "mains".into()), (1, "battery".into())]);
     mode.encoding = Encoding::Plain(Form { names, ..Form::new(Kind::U16) });
     let device = DeviceSettings { device: device_of(vec![mode]).into(), ..device() };
-    let template = |retains: bool| {
-        let gateway = Gateway { retains, ..gateway() };
-        let told = payload(&announcement(&gateway, &device, "cellar", &[None]).message());
-        assert_eq!(told["components"]["mode"]["device_class"], "enum");
-        told["components"]["mode"]["value_template"].clone()
-    };
-    assert_eq!(template(false), "{{ value or none }}");
-    assert_eq!(template(true), Value::Null);
+    let told = payload(&announcement(&gateway(), &device, "cellar", &[None]).message());
+    assert_eq!(told["components"]["mode"]["device_class"], "enum");
+    assert_eq!(told["components"]["mode"]["value_template"], "{{ value or none }}");
 }
 
 #[test]

@@ -52,16 +52,18 @@ impl Outbox {
     /// Buries what `found` has and the present announcement on its topic has not.
     pub(super) fn take_leave(&mut self, found: Announcement) {
         let Some(entry) = self.retained.get(found.topic()) else { return };
-        let topic = found.topic();
-        let Some(present) = Announcement::parse(&self.topics, topic, &entry.payload) else { return };
+        let message = Message::retained(found.topic(), entry.payload.clone());
+        let Some(present) = Announcement::parse(&self.topics, &message.topic, &message.payload) else {
+            return;
+        };
         if let Some(farewell) = homeassistant::farewell(&found, &present) {
-            let message = Message::retained(topic, entry.payload.clone());
             // Home Assistant may have started since then, and buries only what it knows.
             self.push_once(Message { retain: false, ..found.message() });
             self.push_once(farewell);
             self.push_retained(message);
-            self.departed.insert(found.topic().to_string(), found);
+            self.departed.insert(found.topic().to_string(), found.clone());
         }
+        self.hold(&found, &present);
     }
 
     /// Takes away once more what was taken away while Home Assistant may not have listened: it keeps

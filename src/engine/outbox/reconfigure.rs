@@ -84,7 +84,8 @@ impl Outbox {
             && self.is_empty()
             && self.formers.is_empty()
             && self.remembered.is_empty()
-            && self.states_due_at.is_none();
+            && self.states_due_at.is_none()
+            && self.held.is_empty();
         let own = self.own_devices.iter();
         let told = own.filter_map(|topic| {
             let entry = self.retained.get(topic.as_str())?;

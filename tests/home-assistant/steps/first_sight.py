@@ -6,6 +6,8 @@ the broker holds.
 
 import re
 
+import rules
+from announced import Announced
 from fault import same
 from house import LONG_PATIENCE, House
 from steps.devices import AI8, BUS, DO4, RELAY8, SI4, VALVE
@@ -115,13 +117,26 @@ def everything_is_enabled(house: House) -> None:
     count = house.enable()
     found = house.settle()
     house.log_is_empty()
+    digits = digits_of_scales(house, found)
     states = [entity for entity in house.home.ask("entities").values() if entity["platform"] not in ("button", "event")]
     unknown = sum(entity["state"] == "unknown" for entity in states)
     house.report.row(
         "every disabled entity is enabled",
         f"{count} more; of {len(found)} none is unavailable, {unknown} are unknown since the device has no value for "
-        "them; the log is empty",
+        f"them; the {digits} sensors of whole numbers have the digits behind the dot that their scales give; the log is empty",
     )
+
+
+def digits_of_scales(house: House, found: dict[str, Announced]) -> int:
+    """What a profile says of a register decides how many digits Home Assistant shows, without a word about that in it."""
+    seen, wanted = house.home.ask("entities"), {}
+    for key, one in found.items():
+        device = house.by_identity.get(one.identity)
+        point = device and device.points.get(one.point())
+        if point and one.platform == "sensor" and (digits := rules.decimals(point)) is not None:
+            wanted[key] = digits
+    same({key: seen[key]["precision"] for key in wanted}, wanted, "the digits behind the dot")
+    return len(wanted)
 
 
 def the_wire_is_seen(house: House) -> None:
