@@ -12,7 +12,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rustix::buffer::spare_capacity;
-use rustix::event::epoll;
+use rustix::event::{PollFd, PollFlags, epoll, poll};
 use tokio::sync::oneshot;
 
 use crate::edge::bell::Bell;
@@ -296,6 +296,8 @@ struct Shared {
 
 /// Stands for the bell where links have numbers.
 const BELL: u64 = u64::MAX;
+/// What `epoll` counts in.
+const MILLISECOND: Duration = Duration::from_millis(1);
 /// Links that are heard at one look.
 const HEARD_MAX: usize = 64;
 
@@ -361,9 +363,19 @@ impl SharedThread {
 
     /// Waits for whatever comes first.
     fn wait(&self, heard: &mut Vec<epoll::Event>) {
-        let timeout = self.wake_at.map(|at| timespec(self.clock.until(at)));
+        let timeout = self.wake_at.map(|at| self.clock.until(at));
+        // `epoll` counts in milliseconds and rounds them up; what is left of one, `poll` waits for.
+        let timeout = match timeout {
+            Some(left) if left < MILLISECOND => {
+                let links = &mut [PollFd::new(&self.epoll, PollFlags::IN)];
+                let _ = poll(links, Some(&timespec(left)));
+                Some(Duration::ZERO)
+            }
+            Some(long) => Some(Duration::from_millis(long.as_millis() as u64)),
+            None => None,
+        };
         // An interruption is as good as a time that has come; nothing else can fail here.
-        let _ = epoll::wait(&self.epoll, spare_capacity(heard), timeout.as_ref());
+        let _ = epoll::wait(&self.epoll, spare_capacity(heard), timeout.map(timespec).as_ref());
     }
 
     /// Wakes everybody if the bell has `rung`, and those whose time has come.

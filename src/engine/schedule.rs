@@ -138,7 +138,8 @@ impl Place {
 /// How much a read is wanted; the greatest is next.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub enum Urgency {
-    /// Time since it last began ÷ its period, at least 1.
+    /// Time since it last began ÷ its period; less than 1 where it has had its share of a bus that cannot keep
+    /// up, and goes only because nothing else is due.
     Overdue(f64),
     Wanted,
     WantedSelector,
@@ -153,8 +154,40 @@ pub struct Outlook {
     pub reads: Option<ByPeriod>,
 }
 
-/// Of the fast and of the slow reads, when the one began that began longest ago, and its period.
-pub type ByPeriod = [Option<(Time, Duration)>; 2];
+/// Of the fast and of the slow reads, the one that has waited longest.
+pub type ByPeriod = [Option<Waiting>; 2];
+
+/// What a read waits for that is wanted by its period.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Waiting {
+    /// From when on it counts its period; ahead of now where it has had more than its share of a bus that cannot
+    /// keep up.
+    began_at: Time,
+    /// When it last really began, if that is known.
+    sent_at: Option<Time>,
+    period: Duration,
+}
+
+impl Waiting {
+    /// A period after it was sent at the latest: on a bus where nothing else is due it waits for no more.
+    fn due_at(&self) -> Time {
+        self.sent_at.map_or(self.began_at, |sent_at| sent_at.min(self.began_at)) + self.period
+    }
+
+    /// `None`: it is not due.
+    fn urgency(&self, now: Time) -> Option<f64> {
+        (now >= self.due_at()).then(|| periods(now - self.began_at, self.period))
+    }
+
+    /// What is as urgent as either of them at any time, or more.
+    fn or(self, other: Waiting) -> Waiting {
+        Waiting {
+            began_at: self.began_at.min(other.began_at),
+            sent_at: self.sent_at.into_iter().chain(other.sent_at).min(),
+            period: self.period.min(other.period),
+        }
+    }
+}
 
 impl Outlook {
     /// `None`: nothing is due.
@@ -163,11 +196,8 @@ impl Outlook {
             return None;
         }
         let Some(reads) = &self.reads else { return Some(Urgency::WantedSelector) };
-        let overdue = reads.iter().flatten().filter(|(began_at, period)| now - *began_at >= *period);
-        overdue
-            .map(|(began_at, period)| periods(now - *began_at, *period))
-            .reduce(f64::max)
-            .map(Urgency::Overdue)
+        let overdue = reads.iter().flatten().filter_map(|waiting| waiting.urgency(now));
+        overdue.reduce(f64::max).map(Urgency::Overdue)
     }
 }
 
@@ -242,9 +272,9 @@ impl Polls {
             if planned.wanted_now || planned.is_repeated || now < planned.paused_until {
                 return None;
             }
-            if let (Some(began_at), Some(period)) = (planned.began_at, planned.period) {
+            if let Some(waiting) = planned.waiting() {
                 let oldest = &mut oldest[usize::from(planned.read.poll == Poll::Slow)];
-                *oldest = (*oldest).filter(|(before, _)| *before <= began_at).or(Some((began_at, period)));
+                *oldest = Some(oldest.map_or(waiting, |oldest| oldest.or(waiting)));
             }
         }
         Some(oldest)
@@ -498,13 +528,16 @@ impl Planned {
         if self.wanted_now {
             return Some(if self.has_selector { Urgency::WantedSelector } else { Urgency::Wanted });
         }
-        let (period, began_at) = (self.period?, self.began_at?);
-        let waited = now - began_at;
+        let waiting = self.waiting()?;
         if self.is_repeated {
-            let waited = waited.saturating_sub(REPEATED_BEHIND);
-            return Some(Urgency::Overdue(periods(waited, period).max(1.0)));
+            let waited = (now - waiting.began_at).saturating_sub(REPEATED_BEHIND);
+            return Some(Urgency::Overdue(periods(waited, waiting.period).max(1.0)));
         }
-        (waited >= period).then(|| Urgency::Overdue(periods(waited, period)))
+        waiting.urgency(now).map(Urgency::Overdue)
+    }
+
+    fn waiting(&self) -> Option<Waiting> {
+        Some(Waiting { began_at: self.began_at?, sent_at: self.sent_at, period: self.period? })
     }
 
     /// For how many of its periods it has waited. What has no period and is wanted counts in tens of seconds,
@@ -521,11 +554,8 @@ impl Planned {
         if self.sleeps {
             return None;
         }
-        let due = if self.wanted_now || self.is_repeated {
-            Time::default()
-        } else {
-            self.began_at? + self.period?
-        };
+        let due =
+            if self.wanted_now || self.is_repeated { Time::default() } else { self.waiting()?.due_at() };
         Some(due.max(self.paused_until))
     }
 }

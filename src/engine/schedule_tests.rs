@@ -76,6 +76,19 @@ fn an_overloaded_bus_stretches_every_period_by_the_same_factor() {
 }
 
 #[test]
+fn nothing_waits_on_a_bus_that_cannot_keep_up_while_nothing_else_is_due() {
+    let mut polls = polls(&[Poll::Fast]);
+    let (mut now, mut pace) = (Time::default(), Pace::default());
+    // Some take much longer than the period, and some hardly longer.
+    for cost in [104, 160, 160].into_iter().cycle().take(300) {
+        assert!(polls.most_urgent(now).is_some(), "{now:?}: due at {:?}", polls.due_at());
+        polls.begin(0, now, &mut pace);
+        polls.end(0);
+        now += Duration::from_millis(cost);
+    }
+}
+
+#[test]
 fn what_was_asked_in_vain_is_due_at_once_but_not_before_what_is_more_overdue() {
     let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
     run(&mut polls, Duration::from_millis(5), Time::from_millis(5_000));

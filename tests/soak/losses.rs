@@ -87,11 +87,13 @@ fn what_is_disturbed_in_step_with_the_polls_starves_no_reading() {
 /// How long it may take until a reading is told anew: so long,
 const WITHOUT_NEWS: Duration = Duration::from_secs(20);
 /// or so many times as long as the line takes for one answer to each read, where that is longer: with half of all
-/// requests lost, and two response timeouts of silence for each of them, twelve reads share few answers;
+/// requests lost, and two response timeouts of silence for each of them, twelve reads share few answers. Chance may
+/// make it longer now and then: begin the disturbance a little earlier or later, and it is none, one or two of 225,
 const OF_ITS_SHARE: f64 = 9.0;
-/// but no longer than this. And chance may bring some waits of a quarter of a minute, but not many: 12 to 13 of a hundred
-/// when the disturbance begins a little earlier or later.
+const LONGER_PERCENT: usize = 1;
+/// but no longer than this.
 const WITHOUT_NEWS_LONGEST: Duration = Duration::from_secs(50);
+/// And some waits of a quarter of a minute, but not many: 11 to 14 of a hundred.
 const LONG: Duration = Duration::from_secs(15);
 const LONG_PERCENT: usize = 16;
 
@@ -105,12 +107,16 @@ fn no_reading_starves_whatever_the_period_at_which_its_line_is_disturbed() {
             lines.map(|(units, poll)| scope.spawn(move || waits_on_line(units, poll))).collect();
         threads.into_iter().flat_map(|thread| thread.join().expect("a line that lives")).collect()
     });
-    for wait in &waits {
-        let longest = wait.share.mul_f64(OF_ITS_SHARE).max(WITHOUT_NEWS).min(WITHOUT_NEWS_LONGEST);
-        assert!(wait.longest <= longest, "{wait:?}");
-    }
+    let many = |percent: usize| waits.len() * percent / 100;
+    let longest = waits.iter().max_by_key(|wait| wait.longest);
+    assert!(longest.is_some_and(|wait| wait.longest <= WITHOUT_NEWS_LONGEST), "{longest:?}");
+    let longer: Vec<&Wait> = waits
+        .iter()
+        .filter(|wait| wait.longest > wait.share.mul_f64(OF_ITS_SHARE).max(WITHOUT_NEWS))
+        .collect();
+    assert!(longer.len() <= many(LONGER_PERCENT), "{longer:?}");
     let long = waits.iter().filter(|wait| wait.longest > LONG).count();
-    assert!(long * 100 <= waits.len() * LONG_PERCENT, "{long} of {} are longer than {LONG:?}", waits.len());
+    assert!(long <= many(LONG_PERCENT), "{long} of {} are longer than {LONG:?}", waits.len());
 }
 
 /// What a disturbance does to the readings of unit 1.
