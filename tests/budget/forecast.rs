@@ -83,7 +83,7 @@ fn cases() -> Vec<Case> {
     };
     let with_one_resting = |fast: &str, slow: &str| {
         let mut devices = mixed(fast, slow);
-        devices[0].0 += DELAY;
+        devices[0] = (format!("fast: 20ms, slow: {slow}{DELAY}"), more(2, "fast"));
         devices
     };
     vec![
@@ -144,7 +144,7 @@ fn cases() -> Vec<Case> {
             what: "one of six wants silence, and all are too slow",
             bus: W1,
             turnaround: "5ms",
-            devices: with_one_resting("70ms", "1s"),
+            devices: with_one_resting("100ms", "1s"),
         },
         Case { what: "two classes, too slow", bus: W1, turnaround: "5ms", devices: mixed("100ms", "1s") },
         Case {

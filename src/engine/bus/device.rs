@@ -61,7 +61,7 @@ pub(super) struct DeviceState {
     pub(super) idle_rest: Duration,
     turnaround: Turnaround,
     polls: Polls,
-    /// How it keeps up with its periods, where it wants silence before each request.
+    /// How it keeps up with its periods, where it wants more silence than they leave it: never.
     own_pace: Pace,
     /// What the device has refused to give in one answer.
     refused: Vec<Span>,

@@ -179,8 +179,6 @@ pub struct Bus {
     /// them costs more than everything else.
     feeds: bool,
     has_settings: bool,
-    /// The devices that want silence before each request.
-    resting: Vec<usize>,
     is_anyone_leaving: bool,
     now: Time,
 }
@@ -265,7 +263,6 @@ impl Bus {
         let record_due_at = devices.iter().filter_map(DeviceState::record_due_at).min();
         let feeds = devices.iter().any(DeviceState::wants_feeding);
         let has_settings = devices.iter().any(DeviceState::has_settings);
-        let resting = turns::resting(&devices);
         Bus {
             name: bus.name.clone(),
             link: bus.link.clone(),
@@ -298,7 +295,6 @@ impl Bus {
             record_due_at,
             feeds,
             has_settings,
-            resting,
             is_anyone_leaving: false,
             now,
         }

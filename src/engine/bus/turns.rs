@@ -68,9 +68,6 @@ impl Bus {
                     continue;
                 }
                 self.pace.idle(now);
-                for index in self.resting.iter().copied() {
-                    self.devices[index].is_idle(now);
-                }
                 // No read has had to wait for what went out of turn.
                 self.ahead = 0;
                 return;
@@ -174,7 +171,6 @@ impl Bus {
     pub(super) fn look_what_they_have(&mut self) {
         self.feeds = self.devices.iter().any(DeviceState::wants_feeding);
         self.has_settings = self.devices.iter().any(DeviceState::has_settings);
-        self.resting = resting(&self.devices);
     }
 
     /// A poll that waits for the line to be silent must not keep a command waiting for a whole turn, and no
@@ -273,11 +269,6 @@ impl Bus {
         });
         self.ask(request, now, timeout);
     }
-}
-
-/// The devices that want silence before each request: of most buses none.
-pub(super) fn resting(devices: &[DeviceState]) -> Vec<usize> {
-    (0..devices.len()).filter(|index| devices[*index].wants_rest()).collect()
 }
 
 /// Not a device that leaves. And one whose watchdog must run out is not spoken to.

@@ -45,29 +45,12 @@ impl DeviceState {
         self.last_answer_end + self.settings.device.wire.limits.delay
     }
 
-    /// Whether something is due that only waits until the device has rested.
-    pub(in crate::engine::bus) fn only_rests(&self, now: Time) -> bool {
-        now < self.rested_at() && self.is_present() && self.polls.due_at().is_some_and(|due| due <= now)
-    }
-
-    /// Whether it wants silence before each request.
-    pub(in crate::engine::bus) fn wants_rest(&self) -> bool {
-        !self.settings.device.wire.limits.delay.is_zero()
-    }
-
     /// Whether its requests and the silence before them take so long that its periods are longer by more than those
     /// of its bus.
     fn is_filled_by_rest(&self, of_bus: &Pace) -> bool {
         let cost = self.tariff.cost(self.turnaround.planned_with());
         let rest = self.settings.device.wire.limits.delay;
         !rest.is_zero() && self.polls.filled(|read| cost.time_of(read.span) + rest) > of_bus.stretch()
-    }
-
-    /// Nothing is due on its bus.
-    pub(in crate::engine::bus) fn is_idle(&mut self, now: Time) {
-        if !self.only_rests(now) {
-            self.own_pace.idle(now);
-        }
     }
 
     /// How urgent its next question can be at most.
