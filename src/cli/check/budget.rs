@@ -36,6 +36,7 @@ pub struct Budget {
 impl Budget {
     pub fn of(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> Budget {
         let tariff = Tariff::of(&bus.link, bus.gap);
+        let taken = tariff.taken(&bus.link, turnaround);
         // As the running program plans them once it knows the device.
         let planned_with = plan::planned_with(turnaround);
         let (mut reads, mut wants) = (Vec::new(), Vec::new());
@@ -44,9 +45,9 @@ impl Budget {
         for (device, (settings, idle_rest)) in devices.iter().zip(rests).enumerate() {
             let wire = &settings.device.wire;
             longest_timeout = longest_timeout.max(wire.response_timeout.unwrap_or_default());
-            wants.push(Wants::of(settings, tariff.cost(turnaround)));
+            wants.push(Wants::of(settings, taken));
             for read in plan(&settings.device, tariff.cost(planned_with + idle_rest), &[]) {
-                let time = tariff.cost(turnaround).time_of(read.span);
+                let time = taken.time_of(read.span);
                 let rest = wire.limits.delay;
                 let period = match read.poll {
                     Poll::Fast => Some(wire.intervals.fast.as_secs_f64()),
@@ -95,7 +96,7 @@ impl Budget {
     fn load_at(&self, stretch: f64) -> f64 {
         let of_device = |(device, wants): (usize, &Wants)| {
             let reads = self.reads.iter().filter(|read| read.device == device);
-            let stretch = stretch.max(self.rests(device));
+            let stretch = stretch.max(self.rests(device, stretch));
             match wants.fed_every {
                 None => reads.filter_map(Planned::load).sum::<f64>() / stretch + wants.load_of_beats(),
                 Some(every) => round::load(&reads.collect::<Vec<_>>(), &wants.beats, every, stretch),
@@ -122,19 +123,61 @@ impl Budget {
     /// How many times as long every period of a device is: as of all on its bus, or because it wants more
     /// silence than its periods leave it.
     pub fn stretch_of(&self, device: usize) -> f64 {
-        self.load().max(self.rests(device)).max(1.0)
+        let load = self.load().max(1.0);
+        load.max(self.rests(device, load))
     }
 
-    /// How much of the time a device is asked or wants silence; above 1 its periods are longer by as much.
-    fn rests(&self, device: usize) -> f64 {
-        let of_device = self.reads.iter().filter(|read| read.device == device && read.rest > 0.0);
-        of_device.filter_map(|read| Some((read.time + read.rest) / read.period?)).sum()
+    /// How much of the time a device is asked, wants silence, or waits behind it for the request that is on the wire
+    /// then; above 1 its periods are longer by as much. `stretch`: so many times as long are those of the others.
+    fn rests(&self, device: usize, stretch: f64) -> f64 {
+        let own = || self.reads.iter().filter(|read| read.device == device && read.rest > 0.0);
+        let filled = |more: f64| -> f64 {
+            own().filter_map(|read| Some((read.time + read.rest + more) / read.period?)).sum()
+        };
+        let alone = filled(0.0);
+        if alone <= 0.0 {
+            return 0.0;
+        }
+        let own_share = own().filter_map(Planned::load).sum::<f64>() / alone.max(stretch);
+        // (Those that want silence as well fall into step with it, each in the other's silence.)
+        let others = self.reads.iter().filter(|read| read.device != device && read.rest == 0.0);
+        let asked: Vec<(f64, f64)> =
+            others.filter_map(|read| Some((1.0 / read.period?, read.time))).collect();
+        let share = asked.iter().map(|(often, time)| often * time / stretch).sum::<f64>()
+            / (1.0 - own_share).max(0.1);
+        let rest = own().map(|read| read.rest).fold(0.0, f64::max);
+        filled(overshoot(&asked, rest) * share.min(1.0))
     }
 
     /// How long it takes to read everything once that is read again and again.
     pub fn round(&self) -> f64 {
         self.reads.iter().filter(|read| read.period.is_some()).map(|read| read.time + read.rest).sum()
     }
+}
+
+/// Requests follow one another without a pause, each so often and so long as it is told here: how long the last one
+/// that begins within `time` goes on behind it, on average.
+fn overshoot(requests: &[(f64, f64)], time: f64) -> f64 {
+    const STEPS: usize = 100;
+    let all: f64 = requests.iter().map(|(often, _)| often).sum();
+    if all <= 0.0 {
+        return 0.0;
+    }
+    let step = time / STEPS as f64;
+    // By how much of the time is left.
+    let mut behind = vec![0.0; STEPS + 1];
+    for left in 1..=STEPS {
+        let of_request = |(often, takes): &(f64, f64)| {
+            let steps = (takes / step).round() as usize;
+            let over = match left.checked_sub(steps.max(1)) {
+                Some(left) => behind[left],
+                None => takes - left as f64 * step,
+            };
+            often / all * over.max(0.0)
+        };
+        behind[left] = requests.iter().map(of_request).sum();
+    }
+    behind[STEPS]
 }
 
 impl Planned {
