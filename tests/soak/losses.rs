@@ -89,8 +89,10 @@ const WITHOUT_NEWS: Duration = Duration::from_secs(20);
 /// or so many times as long as the line takes for one answer to each read, where that is longer: with half of all
 /// requests lost, and two response timeouts of silence for each of them, twelve reads share few answers;
 const OF_ITS_SHARE: f64 = 9.0;
-/// but no longer than this. And chance may bring some waits of a quarter of a minute, but not many: 12 to 13 of a hundred
-/// when the disturbance begins a little earlier or later.
+/// but no longer than this. No single back-off makes these waits: no fewer are longer than [`LONG`] where a read that is
+/// lost again and again is not asked ever less often, or where a device counts as offline only behind six losses. And
+/// chance may bring some waits of a quarter of a minute, but not many: 12 to 13 of a hundred when the disturbance begins
+/// a little earlier or later.
 const WITHOUT_NEWS_LONGEST: Duration = Duration::from_secs(50);
 const LONG: Duration = Duration::from_secs(15);
 const LONG_PERCENT: usize = 16;
