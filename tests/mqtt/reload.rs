@@ -394,7 +394,8 @@ fn http_moves_to_another_address() {
     let state = tempfile::tempdir().expect("a folder");
     let at = |http: &str| format!("http: {{listen: {http}}}\nstate_dir: {}\n{text}", state.path().display());
     gateway.write_whole(&at("'localhost:0'"));
-    gateway.reload("HTTP on http://");
+    // To its end: what it says last would else be taken for the end of the next one.
+    gateway.reload(DONE);
     let lines = gateway.log();
     let moved = lines.iter().rev().find_map(|line| line.split("HTTP on ").nth(1)).expect("its address");
     let status = |url: &str| ureq::get(url).call().map(|answer| answer.status().as_u16()).ok();
