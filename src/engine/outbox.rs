@@ -131,9 +131,7 @@ impl Outbox {
             self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
             self.tells_once_more = true;
         }
-        if message.retain && message.topic.starts_with(&self.discovery_prefix) {
-            self.held.is_announced(now);
-        }
+        self.held.is_told(now, message.retain && message.topic.starts_with(&self.discovery_prefix));
         self.pace.told(self.is_answer(&message));
         Some(message)
     }
