@@ -140,9 +140,7 @@ impl Outbox {
             self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
             self.tells_once_more = true;
         }
-        if message.retain && message.topic.starts_with(&self.discovery_prefix) {
-            self.held.is_announced(now);
-        }
+        self.held.is_told(now, message.retain && message.topic.starts_with(&self.discovery_prefix));
         self.pace.told(self.is_answer(&message));
         self.taken_back.handed_over(&message.topic, now);
         Some(message)

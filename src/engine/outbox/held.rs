@@ -22,9 +22,9 @@ impl Held {
         self.topics.contains(topic).then_some("None")
     }
 
-    /// Home Assistant is told now what things are.
-    pub(super) fn is_announced(&mut self, now: Time) {
-        if !self.topics.is_empty() {
+    /// Something is told now, perhaps what things are. The announcement itself may be too long to be told ever.
+    pub(super) fn is_told(&mut self, now: Time, is_announcement: bool) {
+        if !self.topics.is_empty() && (is_announcement || self.due.is_none()) {
             self.due = Some(now + STATES_AFTER_DISCOVERY);
         }
     }
