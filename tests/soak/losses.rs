@@ -91,7 +91,8 @@ const WITHOUT_NEWS: Duration = Duration::from_secs(20);
 /// make it longer now and then: begin the disturbance a little earlier or later, and it is none, one or two of 225,
 const OF_ITS_SHARE: f64 = 9.0;
 const LONGER_PERCENT: usize = 1;
-/// but no longer than this.
+/// but no longer than this. No single back-off makes these waits: no fewer are longer than [`LONG`] where a read that is
+/// lost again and again is not asked ever less often, or where a device counts as offline only behind six losses.
 const WITHOUT_NEWS_LONGEST: Duration = Duration::from_secs(50);
 /// And some waits of a quarter of a minute, but not many: 11 to 14 of a hundred.
 const LONG: Duration = Duration::from_secs(15);
