@@ -54,6 +54,8 @@ pub struct Outbox {
     departed: BTreeMap<String, Announcement>,
     /// On which topics what was announced before was told; the broker shall forget those that are ours no more.
     left_behind: BTreeSet<String>,
+    /// On these the devices tell something, if not yet: nothing is taken back there.
+    wanted: BTreeSet<String>,
     taken_back: TakenBack,
     /// What this gateway told below other base topics, until it is known whether somebody else is there.
     formers: Vec<Former>,
@@ -101,6 +103,7 @@ impl Outbox {
             remembered: BTreeMap::new(),
             departed: BTreeMap::new(),
             left_behind: BTreeSet::new(),
+            wanted: BTreeSet::new(),
             taken_back: TakenBack::default(),
             formers: Vec::new(),
             is_left_to_others: false,

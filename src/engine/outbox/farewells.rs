@@ -34,7 +34,7 @@ impl Outbox {
     /// gone, or another layout. To be asked when everything has been told, for only then it is known.
     pub(super) fn next_left_behind(&mut self) -> Option<Message> {
         while let Some(topic) = self.left_behind.pop_first() {
-            if !self.is_told(&topic) {
+            if !self.wanted.contains(&topic) && !self.is_told(&topic) {
                 self.taken_back.add(&topic);
                 return Some(Message::retained(topic, ""));
             }
@@ -83,6 +83,8 @@ impl Outbox {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::super::tests::{LATER, check_sent, outbox, retained, take_all};
     use crate::engine::time::Time;
 
@@ -97,23 +99,41 @@ mod tests {
         )
     }
 
+    /// The same of a device that tells something on these topics.
+    fn telling_on(topics: &[&str]) -> String {
+        let component = |topic: &&str| {
+            format!(
+                "\"{topic}\":{{\"platform\":\"switch\",\"state_topic\":\"{topic}\",\"command_topic\":\"{topic}/set\"}}"
+            )
+        };
+        let components: Vec<String> = topics.iter().map(component).collect();
+        format!(
+            "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
+             \"components\":{{{}}}}}",
+            components.join(",")
+        )
+    }
+
+    #[test]
+    fn nothing_is_taken_back_that_a_device_is_about_to_tell() {
+        let mut outbox = outbox();
+        let wanted = ["busker/boiler/availability", "busker/boiler/info", "busker/boiler/flow"];
+        outbox.recall(BTreeMap::new(), Vec::new(), &wanted.map(String::from).into());
+        // The broker is quicker than the device's bus.
+        let found = telling_on(&["busker/boiler/flow", "busker/boiler/old"]);
+        outbox.found("homeassistant/device/busker_boiler/config", &found);
+        retained(&mut outbox, "busker/boiler/availability", "offline");
+        check_sent(&mut outbox, &["busker/boiler/availability offline", "busker/boiler/old "]);
+        retained(&mut outbox, "busker/boiler/info", "{}");
+        check_sent(&mut outbox, &["busker/boiler/info {}"]);
+    }
+
     #[test]
     fn what_an_earlier_run_told_on_topics_that_are_ours_no_more_is_forgotten_when_all_else_is_told() {
         let config = "homeassistant/device/busker_boiler/config";
-        let with = |topics: &[&str]| {
-            let components: Vec<String> = topics
-                .iter()
-                .map(|topic| format!("\"{topic}\":{{\"platform\":\"switch\",\"state_topic\":\"{topic}\",\"command_topic\":\"{topic}/set\"}}"))
-                .collect();
-            format!(
-                "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
-                 \"components\":{{{}}}}}",
-                components.join(",")
-            )
-        };
         let mut outbox = outbox();
         let told = ["busker/boiler/flow", "busker/boiler/health", "busker/bridge/health"];
-        outbox.found(config, &with(&[&told[..], &["busker/boiler/old", "elsewhere/x"]].concat()));
+        outbox.found(config, &telling_on(&[&told[..], &["busker/boiler/old", "elsewhere/x"]].concat()));
         retained(&mut outbox, "busker/boiler/availability", "online");
         retained(&mut outbox, "busker/boiler/flow", "21.5");
         check_sent(

@@ -43,6 +43,7 @@ impl Outbox {
         trees: Vec<Tree>,
         wanted: &BTreeSet<String>,
     ) {
+        self.wanted.clone_from(wanted);
         for mut tree in trees {
             tree.topics.retain(|topic| !wanted.contains(topic));
             if Topics::new(&tree.base_topic).bridge_state() == self.topics.bridge_state() {

@@ -20,6 +20,7 @@ impl Outbox {
     ) {
         let told_earlier = before.difference(wanted).filter(|topic| !self.retained.contains_key(&***topic));
         self.left_behind.extend(told_earlier.cloned());
+        self.wanted.clone_from(wanted);
         let prefix = self.discovery_prefix.trim_end_matches("/device/").to_string();
         let own = identities.into_iter().map(|identity| topics::discovery(&prefix, &identity));
         self.own_devices = own.collect();
