@@ -66,6 +66,7 @@ const DEVICES: &str = r#"  one:
 
 /// Does everything to unit 1 that is counted, once or more often, and a command.
 fn eventful(peer: &Peer) -> Stage<'_> {
+    peer.misbehave(|_, good| taking_its_time(good));
     let stage = Stage::start(peer, "response_timeout: 200ms", DEVICES, &[("one/a", (1, 4, 0))]);
     stage.shows_all();
     stage.watcher.shows("busker/two/a", "0");
@@ -93,6 +94,11 @@ fn eventful(peer: &Peer) -> Stage<'_> {
     stage
 }
 
+/// No pseudo-terminal takes the time of a wire: what answers at once has no turnaround at all.
+fn taking_its_time(good: Vec<u8>) -> Vec<Step> {
+    vec![Step::Pause(20), Step::Say(good)]
+}
+
 fn number(text: &str) -> f64 {
     text.parse().unwrap_or_else(|_| panic!("{text} is no number"))
 }
@@ -116,7 +122,7 @@ fn every_figure_of_a_bus_and_of_a_device_is_told_in_three_places() {
     let silent = is_silent.clone();
     peer.misbehave(move |asked, good| match asked.unit == 2 && silent.load(Ordering::SeqCst) {
         true => Vec::new(),
-        false => vec![Step::Say(good)],
+        false => taking_its_time(good),
     });
     let told = stage.watcher.shows_what("busker/bridge/health", "that unit 2 is away", |told| {
         let told: Value = serde_json::from_str(told).expect("JSON");
