@@ -237,21 +237,7 @@ pub struct DeviceTopics {
 impl DeviceTopics {
     /// Those of the device, of this run or an earlier one, whose availability stands on `topic`.
     pub fn with_availability_on(topic: &str) -> Option<DeviceTopics> {
-        DeviceTopics::beside(topic, AVAILABILITY)
-    }
-
-    /// Those of the device of which `topic` tells how it is on its wire.
-    pub fn with_health_on(topic: &str) -> Option<DeviceTopics> {
-        DeviceTopics::beside(topic, HEALTH)
-    }
-
-    /// Those of the device whose one message for all stands on `topic`, if it is a device's.
-    pub fn with_json_on(topic: &str) -> DeviceTopics {
-        DeviceTopics { own: topic.to_string() }
-    }
-
-    fn beside(topic: &str, last: &str) -> Option<DeviceTopics> {
-        let own = topic.strip_suffix(last)?.strip_suffix('/')?;
+        let own = topic.strip_suffix(AVAILABILITY)?.strip_suffix('/')?;
         Some(DeviceTopics { own: own.to_string() })
     }
 

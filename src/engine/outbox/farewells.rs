@@ -13,7 +13,8 @@ impl Outbox {
         let Some(found) = Announcement::parse(&self.topics, topic, payload) else {
             return self.found_of_former(topic, payload);
         };
-        for topic in found.told_on().into_iter().filter(|topic| self.topics.are_above(topic)) {
+        let is_gone = |topic: &&str| self.topics.are_above(topic) && !self.wanted.contains(*topic);
+        for topic in found.told_on().into_iter().filter(is_gone) {
             self.left_behind.insert(topic.to_string());
             // What stands beside it without being announced.
             if let Some(device) = DeviceTopics::with_availability_on(topic) {
@@ -34,19 +35,12 @@ impl Outbox {
     /// gone, or another layout. To be asked when everything has been told, for only then it is known.
     pub(super) fn next_left_behind(&mut self) -> Option<Message> {
         while let Some(topic) = self.left_behind.pop_first() {
-            if !self.wanted.contains(&topic) && !self.is_told(&topic) {
+            if !self.wanted.contains(&topic) && !self.retained.contains_key(&*topic) {
                 self.taken_back.add(&topic);
                 return Some(Message::retained(topic, ""));
             }
         }
         None
-    }
-
-    /// Whether something stands on this topic, or may: how a device does is told after a minute, and all its
-    /// values in one message perhaps.
-    fn is_told(&self, topic: &str) -> bool {
-        let device = DeviceTopics::with_health_on(topic).unwrap_or_else(|| DeviceTopics::with_json_on(topic));
-        [topic, &device.availability()].iter().any(|topic| self.retained.contains_key(*topic))
     }
 
     /// Buries what `found` has and the present announcement on its topic has not.
@@ -85,42 +79,47 @@ impl Outbox {
 mod tests {
     use std::collections::BTreeMap;
 
+    use super::super::Outbox;
     use super::super::tests::{LATER, check_sent, outbox, retained, take_all};
     use crate::engine::time::Time;
 
     /// What this gateway announces of a device with these components.
     fn announcement(keys: &[&str]) -> String {
-        let components: Vec<String> =
-            keys.iter().map(|key| format!("\"{key}\":{{\"platform\":\"sensor\"}}")).collect();
-        format!(
-            "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
-             \"components\":{{{}}}}}",
-            components.join(",")
-        )
+        announced(keys.iter().map(|key| format!("\"{key}\":{{\"platform\":\"sensor\"}}")))
     }
 
     /// The same of a device that tells something on these topics.
     fn telling_on(topics: &[&str]) -> String {
-        let component = |topic: &&str| {
+        announced(topics.iter().map(|topic| {
             format!(
                 "\"{topic}\":{{\"platform\":\"switch\",\"state_topic\":\"{topic}\",\"command_topic\":\"{topic}/set\"}}"
             )
-        };
-        let components: Vec<String> = topics.iter().map(component).collect();
+        }))
+    }
+
+    /// Where the boiler tells something now.
+    const WANTED: [&str; 4] =
+        ["busker/boiler/availability", "busker/boiler/info", "busker/boiler/health", "busker/boiler/flow"];
+
+    /// No earlier run is remembered.
+    fn recall_nothing(outbox: &mut Outbox) {
+        outbox.recall(BTreeMap::new(), Vec::new(), &WANTED.map(String::from).into());
+    }
+
+    fn announced(components: impl Iterator<Item = String>) -> String {
         format!(
             "{{\"origin\":{{\"name\":\"busker\"}},\"availability\":[{{\"topic\":\"busker/bridge/state\"}}],\
              \"components\":{{{}}}}}",
-            components.join(",")
+            components.collect::<Vec<_>>().join(",")
         )
     }
 
     #[test]
     fn nothing_is_taken_back_that_a_device_is_about_to_tell() {
         let mut outbox = outbox();
-        let wanted = ["busker/boiler/availability", "busker/boiler/info", "busker/boiler/flow"];
-        outbox.recall(BTreeMap::new(), Vec::new(), &wanted.map(String::from).into());
+        recall_nothing(&mut outbox);
         // The broker is quicker than the device's bus.
-        let found = telling_on(&["busker/boiler/flow", "busker/boiler/old"]);
+        let found = telling_on(&[WANTED[0], "busker/boiler/flow", "busker/boiler/old"]);
         outbox.found("homeassistant/device/busker_boiler/config", &found);
         retained(&mut outbox, "busker/boiler/availability", "offline");
         check_sent(&mut outbox, &["busker/boiler/availability offline", "busker/boiler/old "]);
@@ -132,6 +131,7 @@ mod tests {
     fn what_an_earlier_run_told_on_topics_that_are_ours_no_more_is_forgotten_when_all_else_is_told() {
         let config = "homeassistant/device/busker_boiler/config";
         let mut outbox = outbox();
+        recall_nothing(&mut outbox);
         let told = ["busker/boiler/flow", "busker/boiler/health", "busker/bridge/health"];
         outbox.found(config, &telling_on(&[&told[..], &["busker/boiler/old", "elsewhere/x"]].concat()));
         retained(&mut outbox, "busker/boiler/availability", "online");
