@@ -79,8 +79,8 @@ impl Outbox {
 mod tests {
     use std::collections::BTreeMap;
 
-    use super::super::Outbox;
     use super::super::tests::{LATER, check_sent, outbox, retained, take_all};
+    use super::super::{Outbox, Tree};
     use crate::engine::time::Time;
 
     /// What this gateway announces of a device with these components.
@@ -125,6 +125,15 @@ mod tests {
         check_sent(&mut outbox, &["busker/boiler/availability offline", "busker/boiler/old "]);
         retained(&mut outbox, "busker/boiler/info", "{}");
         check_sent(&mut outbox, &["busker/boiler/info {}"]);
+    }
+
+    #[test]
+    fn the_message_of_all_values_is_taken_back_where_it_is_wanted_no_more() {
+        let mut outbox = outbox();
+        let tree = Tree { base_topic: "busker".into(), topics: ["busker/boiler".to_string()].into() };
+        outbox.recall(BTreeMap::new(), vec![tree], &WANTED.map(String::from).into());
+        retained(&mut outbox, WANTED[0], "online");
+        check_sent(&mut outbox, &["busker/boiler/availability online", "busker/boiler "]);
     }
 
     #[test]
