@@ -1,51 +1,28 @@
-//! Feeds the client library from the mailbox, and hands on what comes in.
+//! Feeds the client library from the mailbox, which also learns from what comes in.
 
 use std::sync::{Arc, Mutex};
 
 use rumqttc::{AsyncClient, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
 use tokio::sync::{mpsc, oneshot};
 
+use super::courier::{Courier, News, mail};
 use super::lock;
 use super::mailbox::Mailbox;
 use super::poller::Seen;
 use crate::edge::clock::Clock;
-use crate::engine::arrivals::{Arrival, Arrivals, Mail};
+use crate::engine::arrivals::{Arrival, Mail};
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::settings::Manner;
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Topics;
 
-/// What the broker has to tell the rest of the program.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum News {
-    Up,
-    Down,
-    Set {
-        device: String,
-        point: String,
-        payload: String,
-        retained: bool,
-    },
-    Get {
-        device: String,
-        point: String,
-    },
-    /// `stale` says why it would be too old to be obeyed.
-    Request {
-        verb: String,
-        payload: String,
-        retained: bool,
-        stale: Option<String>,
-    },
-}
-
-/// Feeds the library from the outbox and hands on what comes in.
+/// Feeds the library from the outbox, and tells it what comes in but for what is for a bus: that has been brought there.
 pub(super) struct Feeder<Tell> {
     pub client: AsyncClient,
     pub clock: Clock,
     pub topics: Topics,
-    pub arrivals: Arrivals,
+    pub courier: Arc<Courier<Tell>>,
     pub mailbox: Arc<Mailbox>,
     pub state: Arc<Mutex<BrokerReport>>,
     pub connection: Arc<Mutex<Connection>>,
@@ -58,7 +35,6 @@ pub(super) struct Feeder<Tell> {
     pub ending: bool,
     /// Whether it was told that others tell something else of this gateway's state.
     pub denied: bool,
-    pub tell: Tell,
 }
 
 impl<Tell: Fn(News)> Feeder<Tell> {
@@ -100,7 +76,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 (self.connected, self.subscribed) = (true, false);
                 self.mailbox.outbox().connected();
                 self.told_up = Some(true);
-                (self.tell)(News::Up);
+                self.courier.tell(News::Up);
             }
             Seen::Down { reason, contested, closed_on } => {
                 let mut state = lock(&self.state);
@@ -119,22 +95,16 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.judge_length(closed_on);
                 if self.told_up != Some(false) {
                     self.told_up = Some(false);
-                    (self.tell)(News::Down);
+                    self.courier.tell(News::Down);
                 }
             }
             Seen::Unsent(messages) => self.mailbox.outbox().give_back(messages),
             Seen::Packet { packet: Packet::Publish(publish), stale_for } => {
                 let payload = String::from_utf8_lossy(&publish.payload);
-                self.receive(&Mail {
-                    topic: &publish.topic,
-                    payload: &payload,
-                    retained: publish.retain,
-                    repeated: publish.dup,
-                    stale_for,
-                });
+                self.receive(&mail(&publish, &payload, stale_for));
             }
             Seen::Packet { packet: Packet::SubAck(answer), .. } => {
-                let codes = answer.return_codes.iter().zip(self.arrivals.filters());
+                let codes = answer.return_codes.iter().zip(self.courier.filters());
                 let refused = codes.filter(|(code, _)| **code == SubscribeReasonCode::Failure);
                 let refused: Vec<&str> = refused.map(|(_, filter)| filter.as_str()).collect();
                 if !refused.is_empty() {
@@ -165,8 +135,8 @@ impl<Tell: Fn(News)> Feeder<Tell> {
     }
 
     fn receive(&mut self, mail: &Mail<'_>) {
-        let Mail { topic, payload, retained, .. } = *mail;
-        match self.arrivals.sort(mail) {
+        let Mail { topic, payload, .. } = *mail;
+        match self.courier.sort(mail) {
             // The last word is this gateway's own, when it ends.
             Arrival::OwnState if self.ending => {}
             Arrival::OwnState => self.heard_state(payload),
@@ -187,17 +157,8 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 tracing::warn!("`{topic}` is not obeyed: {reason}");
                 self.mailbox.outbox().push(outcome);
             }
-            Arrival::Set { device, point } => {
-                let (device, point, payload) = (device.into(), point.into(), payload.into());
-                (self.tell)(News::Set { device, point, payload, retained });
-            }
-            Arrival::Get { device, point } => {
-                (self.tell)(News::Get { device: device.into(), point: point.into() });
-            }
-            Arrival::Request { verb, stale } => {
-                (self.tell)(News::Request { verb: verb.into(), payload: payload.into(), retained, stale });
-            }
-            Arrival::Nothing => {}
+            // The courier has brought it.
+            Arrival::Set { .. } | Arrival::Get { .. } | Arrival::Request { .. } | Arrival::Nothing => {}
         }
     }
 
@@ -243,7 +204,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         if !self.subscribed {
             let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
             self.subscribed =
-                self.client.try_subscribe_many(self.arrivals.filters().iter().map(filter)).is_ok();
+                self.client.try_subscribe_many(self.courier.filters().iter().map(filter)).is_ok();
         }
         self.ask();
         let mut outbox = self.mailbox.outbox();

@@ -1,6 +1,7 @@
-//! The connection to the broker. One task does nothing but poll the client library; another feeds it
-//! with what the outbox holds, and hands on what comes in.
+//! The connection to the broker. One task does nothing but poll the client library, and brings what is for a bus
+//! there at once; another feeds the library with what the outbox holds, and minds all else that comes in.
 
+mod courier;
 mod feeder;
 mod losses;
 mod mailbox;
@@ -12,8 +13,9 @@ use rumqttc::{AsyncClient, LastWill, MqttOptions, QoS};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
+use self::courier::Courier;
+pub use self::courier::News;
 use self::feeder::Feeder;
-pub use self::feeder::News;
 use self::losses::Ends;
 pub use self::mailbox::Mailbox;
 use self::poller::Poller;
@@ -75,7 +77,7 @@ impl Broker {
         secrets: Secrets,
         clock: Clock,
         mailbox: Arc<Mailbox>,
-        tell: impl Fn(News) + Send + 'static,
+        tell: impl Fn(News) + Send + Sync + 'static,
     ) -> Broker {
         let topics = Topics::of(&settings.mqtt);
         let options = options(&settings.mqtt, &topics, secrets);
@@ -85,8 +87,11 @@ impl Broker {
         let state = Arc::new(Mutex::new(BrokerReport::default()));
         let connection = Arc::new(Mutex::new(Connection::default()));
         let (events_out, events) = mpsc::channel(IN_FLIGHT);
+        let arrivals = Arrivals::new(settings, mailbox.look(Outbox::former_states));
+        let courier = Arc::new(Courier::new(arrivals, tell));
         let poller = Poller {
             event_loop,
+            courier: courier.clone(),
             seen: events_out,
             connection: connection.clone(),
             mqtt: settings.mqtt.clone(),
@@ -104,7 +109,7 @@ impl Broker {
             client,
             clock,
             topics,
-            arrivals: Arrivals::new(settings, mailbox.look(Outbox::former_states)),
+            courier,
             mailbox: mailbox.clone(),
             state: state.clone(),
             connection: connection.clone(),
@@ -114,7 +119,6 @@ impl Broker {
             subscribed: false,
             ending: false,
             denied: false,
-            tell,
         };
         let feeder = tokio::spawn(async move {
             feeder.run(events, goodbye_heard).await;

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex};
 use rumqttc::{ConnectionError, EventLoop, Outgoing, Packet, Publish, Request};
 use tokio::sync::mpsc;
 
+use super::courier::{Courier, News, mail};
 use super::lock;
 use super::losses::{Ends, loss};
 use crate::edge::clock::Clock;
@@ -17,8 +18,9 @@ use crate::engine::topics::Message;
 
 /// Polls the client library and nothing else: a library that is not polled neither sends nor answers
 /// pings. Waits between attempts to connect.
-pub(super) struct Poller {
+pub(super) struct Poller<Tell> {
     pub event_loop: EventLoop,
+    pub courier: Arc<Courier<Tell>>,
     pub seen: mpsc::Sender<Seen>,
     pub connection: Arc<Mutex<Connection>>,
     pub mqtt: Mqtt,
@@ -28,7 +30,7 @@ pub(super) struct Poller {
     pub clock: Clock,
 }
 
-impl Poller {
+impl<Tell: Fn(News)> Poller<Tell> {
     /// Until nobody listens.
     pub async fn run(mut self) {
         loop {
@@ -55,7 +57,7 @@ impl Poller {
         }
     }
 
-    /// What is to be told of it. A question for its own sake is asked by the feeder, and its answer is nobody
+    /// What is to be told of it. What is for a bus is brought there. A question for its own sake is asked by the feeder, and its answer is nobody
     /// else's business.
     fn seen(&self, event: rumqttc::Event) -> Option<Seen> {
         let now = self.clock.now();
@@ -63,8 +65,16 @@ impl Poller {
         match event {
             rumqttc::Event::Incoming(packet) => {
                 connection.heard(now);
-                let is_answer = matches!(packet, Packet::UnsubAck(_));
-                (!is_answer).then(|| Seen::Packet { packet, stale_for: connection.stale_for(now) })
+                let stale_for = connection.stale_for(now);
+                drop(connection);
+                let is_dealt_with = match &packet {
+                    Packet::Publish(publish) => {
+                        let payload = String::from_utf8_lossy(&publish.payload);
+                        self.courier.bring(&mail(publish, &payload, stale_for))
+                    }
+                    packet => matches!(packet, Packet::UnsubAck(_)),
+                };
+                (!is_dealt_with).then_some(Seen::Packet { packet, stale_for })
             }
             rumqttc::Event::Outgoing(Outgoing::Unsubscribe(_)) => None,
             rumqttc::Event::Outgoing(sent) => {
@@ -178,12 +188,15 @@ mod tests {
     use rumqttc::{AsyncClient, MqttOptions, QoS, StateError};
 
     use super::*;
+    use crate::engine::arrivals::Arrivals;
+    use crate::engine::configuration;
+    use crate::engine::profile::Library;
     use crate::engine::time::Time;
 
     #[test]
     fn only_what_the_broker_answers_is_a_question() {
         let (_client, event_loop) = AsyncClient::new(MqttOptions::new("id", "localhost", 1883), 10);
-        let poller = poller(event_loop, mpsc::channel(10).0);
+        let poller = poller(event_loop, mpsc::channel(10).0, Box::new(drop));
         let asks_at = || lock(&poller.connection).asks_at();
         lock(&poller.connection).made(Time::default());
         for (sent, is_question) in [
@@ -202,9 +215,15 @@ mod tests {
         }
     }
 
-    fn poller(event_loop: EventLoop, seen: mpsc::Sender<Seen>) -> Poller {
+    type Tell = Box<dyn Fn(News) + Send + Sync>;
+
+    fn poller(event_loop: EventLoop, seen: mpsc::Sender<Seen>, tell: Tell) -> Poller<Tell> {
+        let text = b"mqtt: {url: 'mqtt://localhost'}\nbuses: {cellar: {tcp: 'host:502'}}\n";
+        let loaded = configuration::load("busker.yaml", text, &Library::shipped());
+        let arrivals = Arrivals::new(&loaded.expect("settings").0, Vec::new());
         Poller {
             event_loop,
+            courier: Arc::new(Courier::new(arrivals, tell)),
             seen,
             connection: Arc::new(Mutex::new(Connection::default())),
             mqtt: Mqtt::default(),
@@ -220,20 +239,29 @@ mod tests {
 
     /// The library keeps such a message, and would hand it out after the next connect.
     #[test]
-    fn what_came_with_the_end_of_a_connection_is_handed_on_before_the_end_is_told() {
+    fn what_came_with_the_end_of_a_connection_is_brought_where_it_belongs_before_the_end_is_told() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
         runtime.block_on(async {
             let (_client, mut event_loop) = AsyncClient::new(MqttOptions::new("id", "localhost", 1883), 10);
-            let command = Publish::new("busker/a/b/set", QoS::AtLeastOnce, "ON");
-            let command = Packet::Publish(command);
-            event_loop.state.events.push_back(rumqttc::Event::Incoming(command.clone()));
-            let (seen, mut events) = mpsc::channel(10);
-            let mut poller = poller(event_loop, seen);
+            for (topic, payload) in [("busker/a/b/set", "ON"), ("busker/bridge/state", "offline")] {
+                let publish = Publish::new(topic, QoS::AtLeastOnce, payload);
+                event_loop.state.events.push_back(rumqttc::Event::Incoming(Packet::Publish(publish)));
+            }
+            let (seen, mut events) = mpsc::channel(1);
+            let told = Arc::new(Mutex::new(Vec::new()));
+            let of_poller = told.clone();
+            let mut poller = poller(event_loop, seen, Box::new(move |news| lock(&of_poller).push(news)));
             lock(&poller.connection).made(poller.clock.now());
             let end = ConnectionError::MqttState(StateError::ConnectionAborted);
             let task = tokio::spawn(async move { poller.lost(end).await.is_ok() });
             let first = events.recv().await.expect("two things are told");
-            assert!(matches!(first, Seen::Packet { packet, stale_for: None } if packet == command));
+            // What is for a bus is there, and nobody else hears of it.
+            let (device, point, payload) = ("a".into(), "b".into(), "ON".into());
+            assert_eq!(*lock(&told), [News::Set { device, point, payload, retained: false }]);
+            let Seen::Packet { packet: Packet::Publish(state), stale_for: None } = first else {
+                panic!("the state was not handed on")
+            };
+            assert_eq!(state.topic, "busker/bridge/state");
             let second = events.recv().await.expect("two things are told");
             assert!(matches!(second, Seen::Down { reason, contested: false, .. } if reason.contains("`id`")));
             task.abort();
