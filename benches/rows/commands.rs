@@ -7,38 +7,33 @@ use anyhow::Context;
 
 use super::saturated::cycles;
 use super::{AT_ONCE, Bench, Configured, REGISTERS, Rig, UNITS, W1_LINE, W1_TURNAROUND, points};
-use crate::clock::{now, sleep};
+use crate::clock::{sleep, sleep_until};
 use crate::machine::Watch;
 use crate::report::{Figure, Target, greatest, median, quantile};
-use crate::wire::Behaviour;
+use crate::wire::{Behaviour, Transaction};
 
 const W1: Behaviour =
     Behaviour { line: W1_LINE, turnaround: W1_TURNAROUND, strict: false, counting: false, first_piece: None };
 
-/// Between two commands, so that each has had its outcome.
-const PAUSE: Duration = Duration::from_millis(200);
-/// Multiples of it fill the space between two whole numbers evenly.
-const GOLDEN: f64 = 0.618_033_988_749_895;
+/// Before the moment of a command is chosen: by then the one before has had its outcome, since a transaction in flight,
+/// its write and the poll that reads it back take 91 ms.
+const PAUSE: Duration = Duration::from_millis(100);
 
 pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
     let units: Vec<u8> = (1..=UNITS).collect();
     let points = points(true).0.replacen("poll: fast", "poll: fast, write: 0..65535", 1);
     let mut rig = Rig::start(W1, &Configured { units: &units, points: &points, period: AT_ONCE }, &[])?;
-    rig.wire.take();
+    let transaction = from_one_to_the_next(&rig.wire.take()).context("the bus is not saturated")?;
     rig.observer.take();
     let watch = Watch::start(rig.own())?;
-    let began_at = now();
-    let time = bench.seconds(60, 15).as_nanos() as i64;
     let mut sent: BTreeMap<u16, i64> = BTreeMap::new();
-    let transaction = W1_LINE.read(REGISTERS, W1_TURNAROUND);
-    while now() - began_at < time {
+    for phase in phases(if bench.quick { 128 } else { 512 }) {
         sleep(PAUSE);
-        // At moments that are spread evenly over a transaction: by chance, the median of some hundred commands
-        // would be more than a millisecond beside what it is.
-        let Some(last) = rig.wire.last().and_then(|seen| seen.ended_at) else { continue };
-        let phase = (sent.len() as f64 * GOLDEN).fract();
-        let moment = last + W1_LINE.silence() + transaction + (phase * transaction as f64) as i64;
-        sleep(Duration::from_nanos((moment - now()).max(0) as u64));
+        let last = rig.wire.last().filter(|seen| seen.function == 3);
+        let last = last.context("a command still waits, or nothing is asked any more")?;
+        // The request behind the one that is in flight now, or will be at once, begins two transactions later.
+        let moment = last.heard_at + 2 * transaction + (phase * transaction as f64) as i64;
+        sleep_until(moment);
         let value = 2000 + sent.len() as u16;
         let unit = sent.len() % units.len() + 1;
         let at = rig.observer.publish(&format!("busker/unit_{unit}/p0/set"), &value.to_string())?;
@@ -102,7 +97,7 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
     let figures = [
         Figure::new("W4", "command to its first byte, p50", Target::AtMost(19.0), " ms")
             .reached(median(&latencies))
-            .remark(format!("{count} commands")),
+            .remark(format!("{count} commands; a transaction takes {:.2} ms", transaction as f64 / 1e6)),
         Figure::new("W4", "command to its first byte, p95", Target::AtMost(36.0), " ms")
             .reached([late])
             .remark(format!("the latest {:.1} ms", greatest(&latencies).unwrap_or_default())),
@@ -123,6 +118,22 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
     ];
     bench.tell(noise, figures);
     Ok(())
+}
+
+/// How long a transaction takes on this wire with all that belongs to it: from the first byte of a read to that of the
+/// next one, usually.
+fn from_one_to_the_next(transactions: &[Transaction]) -> Option<i64> {
+    let times = transactions.windows(2).map(|pair| (pair[1].heard_at - pair[0].heard_at) as f64);
+    median(&times.collect::<Vec<_>>()).map(|time| time as i64)
+}
+
+/// Where in a transaction each of so many commands comes: every one in a slice of its own, so that all of it is covered
+/// evenly and once, and neighbours in time are far apart. By chance, the median of some hundred commands would be more
+/// than a millisecond beside what it is. The number is a power of two.
+fn phases(count: u32) -> impl Iterator<Item = f64> {
+    let slice = 1.0 / f64::from(count);
+    let reversed = move |number: u32| f64::from(number.reverse_bits()) / (f64::from(u32::MAX) + 1.0);
+    (0..count).map(move |number| reversed(number) + slice / 2.0)
 }
 
 pub fn w5(bench: &mut Bench) -> anyhow::Result<()> {
