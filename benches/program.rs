@@ -156,6 +156,24 @@ impl Busker {
         machine::cpu_seconds(self.child.id())
     }
 
+    /// How long devices took to answer, on average, as it tells Prometheus; since it began, over all of them.
+    pub fn turnaround(&mut self) -> anyhow::Result<Duration> {
+        let mut page =
+            ureq::get(format!("http://{}/metrics", self.http()?)).call().context("HTTP answers")?;
+        let text = page.body_mut().read_to_string().context("the page of metrics")?;
+        let all = |name: &str| -> f64 {
+            let lines = text
+                .lines()
+                .filter(|line| line.starts_with(&format!("busker_device_turnaround_seconds_{name}{{")));
+            lines.filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok()).sum()
+        };
+        let (sum, count) = (all("sum"), all("count"));
+        if count < 1.0 {
+            bail!("it tells no turnaround");
+        }
+        Ok(Duration::from_secs_f64(sum / count))
+    }
+
     /// In bytes.
     pub fn resident(&self) -> f64 {
         machine::resident(self.child.id())

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::time::Duration;
 
-use super::tcp::{LATENCY, Reached, figures, libmodbus, own, reach};
+use super::tcp::{LATENCY, Reached, figures, forecast, forecast_figure, libmodbus, own, reach};
 use super::{AT_ONCE, Bench};
 use crate::clock::sleep;
 use crate::machine::{Noise, Watch};
@@ -80,6 +80,8 @@ pub fn scale(bench: &mut Bench) -> anyhow::Result<()> {
         Figure::new("scale", "all devices announced after", Target::AtMost(10.0), " s")
             .reached(whole.iter().map(|run| run.growth.announced_after)),
     ]);
+    let forecasts = whole.iter().map(|run| run.forecast / run.reached.registers_per_second);
+    all.push(forecast_figure("scale", forecasts.collect()));
     bench.tell(noise, all);
     Ok(())
 }
@@ -87,6 +89,8 @@ pub fn scale(bench: &mut Bench) -> anyhow::Result<()> {
 struct Run {
     growth: Growth,
     reached: Reached,
+    /// Registers a second.
+    forecast: f64,
     libmodbus: Option<Reached>,
     why: Option<String>,
     noise: Noise,
@@ -154,5 +158,7 @@ fn run(size: Size, time: Duration) -> anyhow::Result<Run> {
         registers_per_second: reached.registers_per_second,
         announced_after: (last_at - busker.started_at) as f64 / 1e9,
     };
-    Ok(Run { growth, reached, libmodbus, why, noise })
+    // After all else, since it makes a page of every reading.
+    let forecast = forecast("scale", &mut busker, size.points * size.words)?;
+    Ok(Run { growth, reached, forecast, libmodbus, why, noise })
 }

@@ -4,6 +4,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use anyhow::Context;
+use serde_json::Value;
 
 use super::{AT_ONCE, Bench};
 use crate::clock::{now, seconds_since, sleep};
@@ -29,7 +30,7 @@ pub fn w6(bench: &mut Bench) -> anyhow::Result<()> {
     let servers = Servers::start(DEVICES, LATENCY, NEW_VALUE_EVERY)?;
     let time = bench.seconds(4, 3);
     let (mut of_busker, mut of_libmodbus) = (Vec::new(), Vec::new());
-    let mut why = None;
+    let (mut why, mut forecasts) = (None, Vec::new());
     let mut noise = Noise::default();
     for _ in 0..bench.runs() {
         // One beside the other, so that both meet the same machine.
@@ -37,11 +38,15 @@ pub fn w6(bench: &mut Bench) -> anyhow::Result<()> {
             Ok(reached) => of_libmodbus.push(reached),
             Err(error) => why = Some(format!("{error:#}")),
         }
-        let (reached, of_run) = busker(&servers, time)?;
+        let (reached, of_run, forecast) = busker(&servers, time)?;
         of_busker.push(reached);
+        forecasts.push(forecast / reached.registers_per_second);
         noise = noise.worse(of_run);
     }
-    bench.tell(noise, figures("W6", &of_busker, &of_libmodbus, why));
+    bench.tell(
+        noise,
+        figures("W6", &of_busker, &of_libmodbus, why).into_iter().chain([forecast_figure("W6", forecasts)]),
+    );
     Ok(())
 }
 
@@ -74,7 +79,27 @@ pub fn figures(
     ]
 }
 
-fn busker(servers: &Servers, time: Duration) -> anyhow::Result<(Reached, Noise)> {
+/// Registers a second as `busker check` foretells them, where devices answer as the program has measured: on Modbus TCP
+/// that is the whole round trip, which is the device's own time and the way to it.
+pub fn forecast(row: &str, busker: &mut Busker, registers: usize) -> anyhow::Result<f64> {
+    let turnaround = busker.turnaround()?;
+    let check = busker.check(row, turnaround)?;
+    let buses = check["buses"].as_array().context("`busker check` tells of no bus")?;
+    let devices = buses.iter().filter_map(|bus| bus["devices"].as_array()).flatten();
+    let period = |device: &Value| device["polls"]["fast"]["real_period"].as_f64();
+    let rates: Option<Vec<f64>> = devices.map(|device| Some(registers as f64 / period(device)?)).collect();
+    Ok(rates.context("`busker check` tells no period")?.iter().sum())
+}
+
+pub fn forecast_figure(row: &'static str, forecasts: Vec<f64>) -> Figure {
+    let what = "registers a second as `busker check` says ÷ measured";
+    Figure::new(row, what, Target::Between(0.95, 1.05), "")
+        .reached(forecasts)
+        .remark(format!("with the round trip that the program has measured; `target/bench/{row}.yaml`"))
+}
+
+/// What it reached, how noisy it was, and what was forecast.
+fn busker(servers: &Servers, time: Duration) -> anyhow::Result<(Reached, Noise, f64)> {
     let points = (0..REGISTERS)
         .map(|register| format!("p{register}: {{at: holding {register}, type: u16, poll: fast}}"))
         .collect::<Vec<_>>()
@@ -97,7 +122,9 @@ fn busker(servers: &Servers, time: Duration) -> anyhow::Result<(Reached, Noise)>
     sleep(Duration::from_secs(1));
     let watch = Watch::start(own(&busker, &mosquitto))?;
     let reached = reach(servers, &busker, time);
-    Ok((reached, watch.end(own(&busker, &mosquitto))))
+    let noise = watch.end(own(&busker, &mosquitto));
+    let forecast = forecast("W6", &mut busker, REGISTERS)?;
+    Ok((reached, noise, forecast))
 }
 
 /// Seconds of processor time of all that belongs to the measurement.
