@@ -29,8 +29,10 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
     let mut sent: BTreeMap<u16, i64> = BTreeMap::new();
     for phase in phases(if bench.quick { 128 } else { 512 }) {
         sleep(PAUSE);
-        let last = rig.wire.last().filter(|seen| seen.function == 3);
-        let last = last.context("a command still waits, or nothing is asked any more")?;
+        let wire = &rig.wire;
+        let last_read = || wire.last().filter(|seen| seen.function == 3);
+        rig.busker.wait(5.0, "a read behind the last command", || last_read().is_some())?;
+        let last = last_read().context("nothing is asked any more")?;
         // The request behind the one that is in flight now, or will be at once, begins two transactions later.
         let moment = last.heard_at + 2 * transaction + (phase * transaction as f64) as i64;
         sleep_until(moment);
