@@ -141,7 +141,8 @@ impl Busker {
         fs::create_dir_all(target.join("bench"))?;
         let kept = target.join("bench").join(format!("{name}.yaml"));
         fs::copy(self.folder.path().join("busker.yaml"), &kept)?;
-        let turnaround = format!("{}ms", turnaround.as_secs_f64() * 1e3);
+        // It takes whole microseconds.
+        let turnaround = format!("{}ms", turnaround.as_micros() as f64 / 1e3);
         let output = Command::new(&program)
             .args(["check", "--json", "--turnaround", &turnaround, "--config"])
             .arg(&kept)
