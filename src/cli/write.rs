@@ -6,7 +6,9 @@ use super::by_hand::{Asked, ByHand, span};
 use super::read::as_text;
 use super::{Failure, output};
 use crate::engine::address::{Span, Table};
-use crate::engine::command::{CommandFlow, OutcomeKind, Step, words_of};
+use crate::engine::command::{
+    ACCEPTED, ACKNOWLEDGE, BUSY_MAX, CommandFlow, OutcomeKind, PAUSE_BUSY, Step, words_of,
+};
 use crate::engine::device::Order;
 use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::yaml::Scalar;
@@ -80,10 +82,14 @@ fn write_words(device: &mut Asked, span: Span, words: &[u16], call: &Call) -> Re
     if let Err(error) = &written {
         eprintln!("{call}: {error}");
     }
-    let found = match device.ask(&Call::Read(span))? {
+    let is_doing_it = written == Err(RequestError::Exception(ACKNOWLEDGE));
+    let found = match read_back(device, span, words, is_doing_it)? {
         Ok(answer) => words_of(&answer),
         Err(error) if written == Ok(Answer::Written) => {
             return Err(anyhow!("written, but `{span}` cannot be read back: {error}").into());
+        }
+        Err(error) if is_doing_it => {
+            return Err(anyhow!("{ACCEPTED}; `{span}` cannot be read back yet: {error}").into());
         }
         Err(error) => return Err(anyhow!("`{span}` cannot be read back: {error}").into()),
     };
@@ -93,9 +99,31 @@ fn write_words(device: &mut Asked, span: Span, words: &[u16], call: &Call) -> Re
     }
     Err(match written {
         Ok(_) => anyhow!("the device confirmed the write and holds another value"),
+        Err(_) if is_doing_it => {
+            anyhow!("unit {}: {ACCEPTED}, but holds something else still", device.unit())
+        }
         Err(error) => anyhow!("unit {}: {error}", device.unit()),
     }
     .into())
+}
+
+/// What the device holds now. One that has only accepted the words is given the time that a command gives it.
+fn read_back(
+    device: &mut Asked,
+    span: Span,
+    words: &[u16],
+    is_doing_it: bool,
+) -> Result<Result<Answer, RequestError>, Failure> {
+    let times = if is_doing_it { BUSY_MAX } else { 0 };
+    for _ in 0..times {
+        std::thread::sleep(PAUSE_BUSY);
+        match device.ask(&Call::Read(span))? {
+            Err(RequestError::Exception(ACKNOWLEDGE)) => {}
+            Ok(answer) if words_of(&answer) != words => {}
+            ended => return Ok(ended),
+        }
+    }
+    device.ask(&Call::Read(span))
 }
 
 fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {

@@ -44,6 +44,14 @@ pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
     kept_back.set(report.broker.kept_back.len() as f64);
     let help = "Topics that miss something, since the broker takes no message as long";
     registry.register("broker_kept_back", help, kept_back);
+    let not_arriving = OneGauge::default();
+    not_arriving.set(report.broker.not_arriving.len() as f64);
+    let help = "Topics of which the broker does not hand on what is told there, although it confirms it";
+    registry.register("broker_not_arriving", help, not_arriving);
+    let by_others = OneGauge::default();
+    by_others.set(report.broker.announced_by_others.len() as f64);
+    let help = "Devices that another gateway announces to Home Assistant under the same identity";
+    registry.register("broker_announced_by_others", help, by_others);
     counter(&mut registry, "broker_connects", "Connections made", report.broker.connects);
     counter(&mut registry, "messages_dropped", "Messages that waited too long", report.broker.dropped);
 

@@ -26,8 +26,10 @@ pub enum Arrival<'m> {
     /// Somebody may be below a base topic that this gateway had.
     FormerState,
     HomeAssistantStarted,
-    /// The broker keeps this announcement of an earlier run, or of somebody else.
-    Announcement,
+    /// An announcement of an earlier run, of this one, or of somebody else: told just now, or kept by the broker.
+    Announcement {
+        is_news: bool,
+    },
     Set {
         device: &'m str,
         point: &'m str,
@@ -91,7 +93,7 @@ impl Arrivals {
             return Arrival::HomeAssistantStarted.only_if(is_news && mail.payload == ONLINE);
         }
         if mail.topic.ends_with("/config") {
-            return Arrival::Announcement.only_if(mail.retained);
+            return Arrival::Announcement { is_news };
         }
         match self.topics.parse(mail.topic) {
             Some(Incoming::Set { device, point }) => match mail.too_old().filter(|_| is_news) {
@@ -175,7 +177,8 @@ mod tests {
         check("house/bridge/state", "online", &Arrival::FormerState, &Arrival::FormerState);
         check("homeassistant/status", "online", &Arrival::HomeAssistantStarted, nothing);
         check("homeassistant/status", "offline", nothing, nothing);
-        check("homeassistant/device/busker_boiler/config", "{}", nothing, &Arrival::Announcement);
+        let announced = |is_news| Arrival::Announcement { is_news };
+        check("homeassistant/device/busker_boiler/config", "{}", &announced(true), &announced(false));
         // The bus says so of a retained one.
         let set = &Arrival::Set { device: "boiler", point: "flow" };
         check("busker/boiler/flow/set", "21", set, set);

@@ -298,7 +298,7 @@ fn read_integer(resolved: &Resolved<'_>, raw: i128) -> Reading {
         let moment = seconds.and_then(Moment::new);
         return moment.map_or(Reading::Missing(Missing::NotAMoment), Reading::Moment);
     }
-    number.map_or(Reading::Missing(Missing::NotANumber), Reading::Number)
+    number.map_or(Reading::Missing(Missing::TooManyDigits(raw.to_string())), Reading::Number)
 }
 
 /// A raw number in the point's unit, with all the digits that scale, decimals and offset give.
@@ -318,7 +318,9 @@ fn read_float(resolved: &Resolved<'_>, raw: f64) -> Reading {
         value = format!("{value:.digits$e}").parse().unwrap_or(value);
     }
     if !is_told(value) {
-        return Reading::Missing(Missing::NotANumber);
+        // Beyond every number is what only the scale has made so.
+        let told = if value.is_finite() { value } else { raw };
+        return Reading::Missing(Missing::TooManyDigits(format!("{told:e}")));
     }
     let Some(decimals) = resolved.decimals else {
         // Minus zero is told as zero.

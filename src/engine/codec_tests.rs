@@ -32,6 +32,31 @@ fn check_read(form: Form, hex: &str, expected: &str) {
     assert_eq!(read(&resolved, &words(hex)).to_string(), expected, "{form:?} {hex}");
 }
 
+/// Why there is no reading.
+#[track_caller]
+fn check_missing(form: Form, hex: &str, expected: &str) {
+    let device = device(form.clone(), registers(form.kind.registers()), WriteRule::Any);
+    let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");
+    match read(&resolved, &words(hex)) {
+        Reading::Missing(missing) => assert_eq!(missing.to_string(), expected, "{form:?} {hex}"),
+        reading => panic!("{reading}"),
+    }
+}
+
+#[test]
+fn a_number_that_cannot_be_told_is_none_the_less_a_number() {
+    let double = || Form::new(Kind::F64);
+    check_missing(double(), "7E37 E43C 8800 759C", "1e300 has too many digits to be told");
+    check_missing(double(), "FE37 E43C 8800 759C", "-1e300 has too many digits to be told");
+    check_missing(double(), "01A5 6E1F C2F8 F359", "1e-300 has too many digits to be told");
+    check_missing(double(), "7FF8 0000 0000 0000", "not a number");
+    check_missing(double(), "7FF0 0000 0000 0000", "not a number");
+    let scaled = Form { scale: Decimal::integer(1_000_000_000), ..double() };
+    check_missing(scaled, "7FE1 CCF3 85EB C8A0", "1e308 has too many digits to be told");
+    let whole = Form { scale: Decimal::integer(i128::MAX / 2), ..Form::new(Kind::U16) };
+    check_missing(whole, "FFFF", "65535 has too many digits to be told");
+}
+
 fn check_write(form: Form, rule: WriteRule, text: &str, expected: Result<&str, &str>) {
     let device = device(form.clone(), registers(form.kind.registers()), rule.clone());
     let resolved = resolve(&device, 0, &[None]).expect("a plain form resolves");

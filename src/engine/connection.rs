@@ -95,6 +95,11 @@ impl Connection {
         self.is_made().then(|| self.last_asked + ASK_EVERY)
     }
 
+    /// Whether the broker owes an answer.
+    pub fn waits(&self) -> bool {
+        self.asked_at.is_some()
+    }
+
     /// Anything has come from the broker.
     pub fn heard(&mut self, now: Time) {
         // Or has not even asked.
@@ -268,8 +273,10 @@ mod tests {
     fn what_comes_after_a_silence_may_be_as_old_as_the_silence() {
         let mut connection = Connection::default();
         connection.made(at(8));
+        assert!(!connection.waits());
         connection.asked(at(10));
         connection.asked(at(14));
+        assert!(connection.waits());
         assert_eq!(connection.stale_for(at(12)), None, "nothing has arrived");
         connection.heard(at(16));
         assert_eq!(connection.stale_for(at(16)), Some(Duration::from_secs(6)));

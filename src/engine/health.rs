@@ -10,6 +10,8 @@ pub use json::{device_json, drift_json, point_json, seconds};
 pub use readout::{Readout, ReadoutValue};
 pub use spread::{Percentiles, Spread, SpreadReport, Timing, TimingReport};
 
+use std::collections::BTreeMap;
+
 use crate::engine::device::{Category, Point, Poll};
 use crate::engine::modbus::{Discarded, RequestError};
 use crate::engine::time::{Duration, Time};
@@ -336,10 +338,22 @@ pub struct BrokerReport {
     pub state_denied: bool,
     /// Topics of which the broker is not told what stands there, since it takes no message as long.
     pub kept_back: Vec<String>,
+    /// Topics of which the broker does not hand on what is told there, although it confirms it.
+    pub not_arriving: Vec<String>,
+    /// Where other gateways announce what has the identity of something of ours: by discovery topic, their base
+    /// topics.
+    pub announced_by_others: BTreeMap<String, String>,
     /// Messages that wait for it: at most one for each retained topic, and those told once.
     pub waiting: usize,
     /// Messages told once that were dropped since too many waited.
     pub dropped: u64,
+}
+
+impl BrokerReport {
+    /// Whether the broker does not hand on all that this gateway has to tell.
+    pub fn misses_something(&self) -> bool {
+        !(self.kept_back.is_empty() && self.not_arriving.is_empty() && self.announced_by_others.is_empty())
+    }
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -386,7 +400,7 @@ impl GatewayReport {
             Status::Lost
         } else if self.broker.client_id_taken
             || self.broker.state_denied
-            || !self.broker.kept_back.is_empty()
+            || self.broker.misses_something()
             || devices.any(|device| !device.online)
             || self.buses.iter().any(|bus| bus.report.paused)
         {

@@ -2,6 +2,7 @@
 //! messages that are told once; announcements first. The client library forgets what it has not sent when
 //! the connection breaks; this does not.
 
+mod arriving;
 mod claim;
 mod farewells;
 mod former;
@@ -10,6 +11,7 @@ mod manner;
 mod pace;
 mod queue;
 mod reconfigure;
+mod rivals;
 mod taken_back;
 mod too_long;
 
@@ -21,12 +23,16 @@ use crate::engine::settings::Manner;
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::{self, Kind, Message, OFFLINE, ONLINE, Topics};
 
+use arriving::Arriving;
+pub use arriving::NotArriving;
 use claim::Claim;
 use former::Former;
 pub use former::Tree;
 use held::Held;
 use pace::Pace;
 use queue::{Lane, Queue, Queued};
+pub use rivals::RivalNews;
+use rivals::Rivals;
 use taken_back::TakenBack;
 use too_long::TooLong;
 pub use too_long::may_be_too_long;
@@ -62,7 +68,9 @@ pub struct Outbox {
     /// Somebody was there: that one is no more this gateway's to take back.
     is_left_to_others: bool,
     formers_due: Option<Time>,
+    arriving: Arriving,
     claim: Claim,
+    rivals: Rivals,
     held: Held,
     retained: BTreeMap<Arc<str>, Retained>,
     queue: Queue,
@@ -81,6 +89,8 @@ pub struct Outbox {
 struct Retained {
     payload: String,
     queued: bool,
+    /// Something was handed over of it on this connection.
+    is_told: bool,
     number: u64,
     /// The broker may keep a value of an earlier run, which nobody would replace.
     kept: bool,
@@ -108,7 +118,9 @@ impl Outbox {
             formers: Vec::new(),
             is_left_to_others: false,
             formers_due: None,
+            arriving: Arriving::default(),
             claim: Claim::default(),
+            rivals: Rivals::default(),
             held: Held::default(),
             retained: BTreeMap::new(),
             queue: Queue::default(),
@@ -124,6 +136,9 @@ impl Outbox {
 
     /// Takes a message. The newest value of a retained topic replaces one that still waits.
     pub fn push(&mut self, message: Message) {
+        if self.is_withheld(&message) {
+            return;
+        }
         if message.retain {
             self.push_retained(message);
         } else {
@@ -146,6 +161,7 @@ impl Outbox {
         self.held.is_told(now, message.retain && message.topic.starts_with(&self.discovery_prefix));
         self.pace.told(self.is_answer(&message));
         self.taken_back.handed_over(&message.topic, now);
+        self.await_return(&message, now);
         Some(message)
     }
 
@@ -167,7 +183,7 @@ impl Outbox {
                             self.queue.push_front(Lane::Others, Queued::Newest(topic.clone()));
                             return Some(Message::retained(&*topic, ""));
                         }
-                        entry.queued = false;
+                        (entry.queued, entry.is_told) = (false, true);
                         if self.too_long.is(entry.payload.len()) {
                             continue;
                         }
@@ -182,6 +198,7 @@ impl Outbox {
     /// A message from [`Outbox::next_message`] could not be handed over: it is next again.
     pub fn put_back(&mut self, message: Message) {
         self.pace.take_back(self.is_answer(&message));
+        self.await_no_return(&message.topic);
         let lane = self.lane(&message.topic);
         if !message.retain {
             self.queue.push_front(lane, Queued::Once(Box::new(message)));
@@ -191,8 +208,10 @@ impl Outbox {
             if !std::mem::replace(&mut entry.queued, true) {
                 self.queue.push_front(lane, Queued::Newest(message.topic.into()));
             }
-        } else {
+        } else if message.payload.is_empty() {
             self.queue.push_front(lane, Queued::Removal(message.topic));
+        } else {
+            self.queue.push_front(lane, Queued::Once(Box::new(message)));
         }
     }
 
@@ -217,6 +236,7 @@ impl Outbox {
     /// anew, the gateway's own `online` after them, and then what was waiting to be told once.
     pub fn connected(&mut self) {
         self.is_connected = true;
+        self.arriving.begin_anew();
         self.doubt_what_was_taken_back();
         self.push_retained(Message::retained(self.topics.bridge_state(), ONLINE));
         let mut once: Vec<Message> = Vec::new();
@@ -241,7 +261,9 @@ impl Outbox {
         removals.retain(|topic| !self.retained.contains_key(&**topic) && !self.left_behind.contains(topic));
         removals.into_iter().for_each(|topic| self.queue_last(Queued::Removal(topic)));
         last.into_iter().for_each(|topic| self.queue_last(Queued::Newest(topic)));
-        self.retained.values_mut().for_each(|entry| entry.queued = true);
+        for entry in self.retained.values_mut() {
+            (entry.queued, entry.is_told) = (true, false);
+        }
         self.tell_held_first();
         self.states_due_at = None;
     }
@@ -249,6 +271,8 @@ impl Outbox {
     /// The connection is lost, or not made yet.
     pub fn disconnected(&mut self) {
         self.is_connected = false;
+        self.arriving.begin_anew();
+        self.too_long.wait();
         self.doubt_what_was_taken_back();
         self.formers_due = None;
     }
@@ -261,7 +285,7 @@ impl Outbox {
         self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
     }
 
-    /// When [`Outbox::wake`] or [`Outbox::next_message`] has something to do.
+    /// When [`Outbox::wake`] or [`Outbox::next_message`] has something to do; see [`Outbox::awaits_until`] too.
     pub fn wake_at(&self) -> Option<Time> {
         let held_until = self.pace.held_until().filter(|_| !self.is_empty());
         let due = self
@@ -269,6 +293,8 @@ impl Outbox {
             .into_iter()
             .chain(self.formers_due)
             .chain(self.claim.due())
+            .chain(self.rivals.due())
+            .chain(self.too_long.due())
             .chain(self.held.due());
         due.chain(held_until).min()
     }
@@ -276,6 +302,9 @@ impl Outbox {
     /// The time of [`Outbox::wake_at`] has come.
     pub fn wake(&mut self, now: Time) {
         self.wake_claim(now);
+        self.wake_rivals(now);
+        self.wake_arriving(now);
+        self.wake_suspicion(now);
         self.wake_formers(now);
         self.wake_held(now);
         if self.states_due_at.is_some_and(|due| due <= now) {
@@ -319,7 +348,13 @@ impl Outbox {
         } else {
             let topic: Arc<str> = message.topic.as_str().into();
             let kept = !self.values.retain && self.topics.kind(&topic) == Kind::Value;
-            let entry = Retained { payload: message.payload, queued: true, number: self.next_number, kept };
+            let entry = Retained {
+                payload: message.payload,
+                queued: true,
+                is_told: false,
+                number: self.next_number,
+                kept,
+            };
             self.next_number += 1;
             self.retained.insert(topic.clone(), entry);
             self.queue_last(Queued::Newest(topic));
@@ -348,6 +383,15 @@ impl Outbox {
         !message.retain && matches!(self.lane(&message.topic), Lane::Others)
     }
 
+    /// The value that stands on this topic is sent once more.
+    fn tell_again(&mut self, topic: &str) {
+        if let Some(entry) = self.retained.get_mut(topic) {
+            if !std::mem::replace(&mut entry.queued, true) {
+                self.queue_last(Queued::Newest(topic.into()));
+            }
+        }
+    }
+
     fn queue_last(&mut self, queued: Queued) {
         self.queue.push_back(self.lane(queued.topic()), queued);
     }
@@ -362,10 +406,7 @@ impl Outbox {
     /// Puts every retained topic of these ranks into the queue that is not there yet.
     fn queue_again(&mut self, wanted: impl Fn(Rank) -> bool) {
         for topic in self.in_order(wanted) {
-            let Some(entry) = self.retained.get_mut(&topic) else { continue };
-            if !std::mem::replace(&mut entry.queued, true) {
-                self.queue_last(Queued::Newest(topic));
-            }
+            self.tell_again(&topic);
         }
     }
 

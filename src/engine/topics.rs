@@ -102,6 +102,11 @@ impl Topics {
         format!("{}/bridge/state", self.base)
     }
 
+    /// The base topic of the gateway that tells its state on `topic`.
+    pub fn base_of_state(topic: &str) -> Option<&str> {
+        topic.strip_suffix("/bridge/state")
+    }
+
     /// Retained.
     pub fn bridge_info(&self) -> String {
         format!("{}/bridge/info", self.base)

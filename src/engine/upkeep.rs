@@ -325,6 +325,7 @@ impl Upkeep {
             Reading::Missing(
                 missing @ (Missing::UnknownValue(_)
                 | Missing::NotANumber
+                | Missing::TooManyDigits(_)
                 | Missing::NotText
                 | Missing::EmptyText),
             ) => Standing::Differs { found: missing.to_string(), command },

@@ -189,6 +189,8 @@ pub enum Missing {
     UnknownValue(i128),
     /// A floating-point register held no number.
     NotANumber,
+    /// This number would be longer than a state in Home Assistant can be, told without an exponent.
+    TooManyDigits(String),
     /// The text register held no text.
     NotText,
     /// It held a text without a letter. Told as such it would be no value on MQTT: an empty message deletes what
@@ -204,6 +206,24 @@ pub enum Missing {
     Unanswered(String),
 }
 
+/// The specification's words for an exception code.
+pub const fn exception_name(code: u8) -> &'static str {
+    match code {
+        1 => "illegal function",
+        2 => "illegal data address",
+        3 => "illegal data value",
+        4 => "device failure",
+        5 => "acknowledge",
+        6 => "device busy",
+        // Of the first specification; some devices still say it.
+        7 => "negative acknowledge",
+        8 => "memory parity error",
+        10 => "gateway path unavailable",
+        11 => "gateway target failed to respond",
+        _ => "unknown exception",
+    }
+}
+
 impl Missing {
     /// A word for programs.
     pub const fn name(&self) -> &'static str {
@@ -215,6 +235,7 @@ impl Missing {
             Missing::Invalid(_) => "invalid",
             Missing::UnknownValue(_) => "unknown_value",
             Missing::NotANumber => "not_a_number",
+            Missing::TooManyDigits(_) => "too_many_digits",
             Missing::NotText => "not_text",
             Missing::EmptyText => "empty_text",
             Missing::NoState => "no_state",
@@ -235,11 +256,12 @@ impl fmt::Display for Missing {
             Missing::Invalid(reason) => write!(f, "{reason}"),
             Missing::UnknownValue(raw) => write!(f, "unknown value {raw}"),
             Missing::NotANumber => write!(f, "not a number"),
+            Missing::TooManyDigits(number) => write!(f, "{number} has too many digits to be told"),
             Missing::NotText => write!(f, "not a text"),
             Missing::EmptyText => write!(f, "an empty text"),
             Missing::NoState => write!(f, "what its points say is none of its states"),
             Missing::NotAMoment => write!(f, "no date and time"),
-            Missing::Exception(code) => write!(f, "exception {code}"),
+            Missing::Exception(code) => write!(f, "exception {code} ({})", exception_name(*code)),
             Missing::Unanswered(error) => write!(f, "{error}, again and again"),
         }
     }

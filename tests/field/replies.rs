@@ -302,7 +302,7 @@ fn busy() {
     let told = stage.watcher.payloads("busker/failing/a");
     assert!(told.iter().all(|told| told == "None"), "{told:?}");
     let failing = stage.device("failing");
-    assert!(failing["points"][0]["reason"] == "exception 4", "{failing}");
+    assert!(failing["points"][0]["reason"] == "exception 4 (device failure)", "{failing}");
 }
 
 fn three_faults() {

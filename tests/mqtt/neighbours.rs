@@ -156,3 +156,88 @@ fn a_second_gateway_with_the_same_state_dir_does_not_start() {
     gateway.kill();
     other.reload("what has changed is at work");
 }
+
+/// Two gateways whose base topics and devices join to one identity, and what else they have is their own.
+#[test]
+fn what_one_gateway_has_announced_no_other_takes_and_both_places_are_told() {
+    const PLACE: &str = "homeassistant/device/busker_cellar_relays/config";
+    let mut broker = Broker::start_persistent();
+    let simulations = [simulation(), simulation()];
+    let ports = simulations.each_ref().map(over_tcp);
+    let watcher = Watcher::start(&broker, "watcher");
+    let wanted = |base: &str, device: &str, index: usize| {
+        let rest = configuration(&ports[index]).replace("relays: {", &format!("{device}: {{"));
+        format!("mqtt: {{url: '{}', base_topic: {base}}}\n{rest}", broker.url())
+    };
+    let (of_first, of_second) = (wanted("busker_cellar", "relays", 0), wanted("busker", "cellar_relays", 1));
+    let changed = wanted("busker", "hall_relays", 1);
+    let check_whose = |broker: &Broker, expected: &str| {
+        support::wait_for(&format!("the announcement of `{expected}`"), || {
+            // For a moment nothing may stand there.
+            let all = remembered(broker, "newcomer");
+            let config = json(&all.iter().find(|got| got.topic == PLACE)?.payload);
+            (config["components"]["relay_1"]["command_topic"] == expected).then_some(())
+        });
+    };
+    let (firsts, seconds) = ("busker_cellar/relays/relay_1/set", "busker/cellar_relays/relay_1/set");
+
+    let first = Gateway::start_with(&of_first);
+    watcher.wait_for("busker_cellar/bridge/state", "online");
+    watcher.wait_until("it is announced", |got| got.topic == PLACE);
+    let second = Gateway::start_with(&of_second);
+    second.wait_for_log("the gateway with `base_topic: busker_cellar` has announced a device");
+    watcher.wait_for("busker/bridge/state", "online");
+    watcher.wait_for("busker/cellar_relays/availability", "online");
+    watcher.wait_until("its other device", |got| got.topic == "homeassistant/device/busker_counters/config");
+    check_whose(&broker, firsts);
+    let has_rival = |gateway: &Gateway, rival: &str| {
+        let expected = serde_json::json!({PLACE: rival});
+        support::wait_for("the other one to be told", || {
+            (health(gateway)["broker"]["announced_by_others"] == expected).then_some(())
+        });
+        assert_eq!(health(gateway)["status"], "degraded");
+    };
+    has_rival(&second, "busker_cellar");
+    assert_eq!(health(&first)["status"], "ok");
+    // Its own topics are not touched by that.
+    watcher.publish(seconds, "ON");
+    watcher.wait_for("busker/cellar_relays/relay_1", "ON");
+    // Home Assistant starts, and so does the second gateway once more.
+    watcher.publish("homeassistant/status", "online");
+    let second = second.start_again(|| (), &of_second);
+    watcher.wait_for("busker/bridge/state", "offline");
+    has_rival(&second, "busker_cellar");
+    check_whose(&broker, firsts);
+
+    // With another name the device is announced, and the first one's stays.
+    second.write(&changed);
+    second.reload("what has changed is at work");
+    watcher.wait_until("its new name", |got| got.topic == "homeassistant/device/busker_hall_relays/config");
+    support::wait_for("all to be well", || (health(&second)["status"] == "ok").then_some(()));
+    check_whose(&broker, firsts);
+
+    // Where the first one goes for good, the second may have the place.
+    second.write(&of_second);
+    second.reload("what has changed is at work");
+    has_rival(&second, "busker_cellar");
+    let elsewhere = of_first.replace("relays: {", "shed_relays: {");
+    first.write(&elsewhere);
+    first.reload("what has changed is at work");
+    support::wait_for("the place to be taken", || {
+        (health(&second)["broker"]["announced_by_others"] == serde_json::json!({})).then_some(())
+    });
+    watcher.wait_until("it is announced", |got| got.topic == PLACE && got.payload.contains(seconds));
+    check_whose(&broker, seconds);
+
+    // Both come to a broker that has forgotten everything: one of them has it, whichever.
+    first.write(&of_first);
+    first.reload("what has changed is at work");
+    has_rival(&first, "busker");
+    check_whose(&broker, seconds);
+    broker.restart();
+    for gateway in [&first, &second] {
+        gateway.wait_for_health(200);
+    }
+    has_rival(&first, "busker");
+    assert_eq!(health(&second)["status"], "ok");
+}

@@ -9,6 +9,7 @@ use super::courier::{Courier, News, mail};
 use super::lock;
 use super::mailbox::Mailbox;
 use super::poller::Seen;
+use super::warnings;
 use crate::edge::clock::Clock;
 use crate::engine::arrivals::{Arrival, Mail};
 use crate::engine::connection::Connection;
@@ -40,15 +41,14 @@ pub(super) struct Feeder<Tell> {
 impl<Tell: Fn(News)> Feeder<Tell> {
     pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut goodbye: oneshot::Receiver<()>) {
         loop {
-            let wake_at = self.mailbox.outbox().wake_at().into_iter().chain(self.asks_at()).min();
-            let until = wake_at.map_or(Duration::from_secs(3600), |time| self.clock.until(time));
+            let until = self.wake_at().map_or(Duration::from_secs(3600), |time| self.clock.until(time));
             tokio::select! {
                 seen = events.recv() => match seen {
                     Some(seen) => self.handle(seen),
                     None => return,
                 },
                 () = self.mailbox.news.notified() => {}
-                () = tokio::time::sleep(until) => self.mailbox.outbox().wake(self.clock.now()),
+                () = tokio::time::sleep(until) => self.wake(),
                 _ = &mut goodbye, if !self.ending => {
                     self.ending = true;
                     self.mailbox.outbox().goodbye();
@@ -114,7 +114,9 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                         refused.join("`, `")
                     );
                 }
-                self.mailbox.outbox().listens(self.clock.now());
+                let mut outbox = self.mailbox.outbox();
+                outbox.cannot_hear(&refused);
+                outbox.listens(self.clock.now());
             }
             Seen::Packet { .. } | Seen::Room => {}
         }
@@ -141,7 +143,12 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             Arrival::OwnState if self.ending => {}
             Arrival::OwnState => self.heard_state(payload),
             Arrival::FormerState => {
-                let somebody = self.mailbox.outbox().heard_former(topic, payload);
+                let somebody = {
+                    let mut outbox = self.mailbox.outbox();
+                    let somebody = outbox.heard_former(topic, payload);
+                    warnings::tell(&mut outbox, &self.topics);
+                    somebody
+                };
                 if let Some(base) = somebody {
                     tracing::warn!(
                         "what this gateway told below `{base}` before is not taken back: somebody else is online there"
@@ -152,7 +159,14 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 tracing::info!("Home Assistant has started: announcing all devices again");
                 self.mailbox.outbox().home_assistant_started(self.clock.now());
             }
-            Arrival::Announcement => self.mailbox.outbox().found(topic, payload),
+            Arrival::Announcement { is_news } => {
+                let mut outbox = self.mailbox.outbox();
+                match is_news {
+                    true => outbox.heard_announcement(topic, payload, self.clock.now()),
+                    false => outbox.found(topic, payload),
+                }
+                warnings::tell(&mut outbox, &self.topics);
+            }
             Arrival::Expired { reason, outcome } => {
                 tracing::warn!("`{topic}` is not obeyed: {reason}");
                 self.mailbox.outbox().push(outcome);
@@ -160,6 +174,25 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             // The courier has brought it.
             Arrival::Set { .. } | Arrival::Get { .. } | Arrival::Request { .. } | Arrival::Nothing => {}
         }
+    }
+
+    fn wake_at(&self) -> Option<Time> {
+        let of_outbox = {
+            let outbox = self.mailbox.outbox();
+            outbox.wake_at().into_iter().chain(outbox.awaits_until()).min()
+        };
+        of_outbox.into_iter().chain(self.asks_at()).min()
+    }
+
+    fn wake(&self) {
+        let now = self.clock.now();
+        let waits = lock(&self.connection).waits();
+        let mut outbox = self.mailbox.outbox();
+        if waits {
+            outbox.listen_longer(now);
+        }
+        outbox.wake(now);
+        warnings::tell(&mut outbox, &self.topics);
     }
 
     fn heard_state(&mut self, payload: &str) {

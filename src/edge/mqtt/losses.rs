@@ -19,7 +19,8 @@ impl Ends {
         format!(
             "the broker at {address} lets this gateway in and closes the connection, again and again: most likely \
              another client has the identifier `{client_id}` too, as a second gateway with `base_topic: {base_topic}` \
-             has. Each needs a base topic of its own; this one tries again after growing pauses"
+             has, or with one that differs from it only where an identifier has `_`. Each needs a base topic of its \
+             own; this one tries again after growing pauses"
         )
     }
 

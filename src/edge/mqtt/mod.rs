@@ -6,6 +6,7 @@ mod feeder;
 mod losses;
 mod mailbox;
 mod poller;
+mod warnings;
 
 use std::sync::{Arc, Mutex};
 
@@ -58,6 +59,8 @@ impl BrokerState {
         (report.waiting, report.dropped) = (outbox.waiting(), outbox.dropped());
         report.state_denied = outbox.is_denied(self.clock.now());
         report.kept_back = outbox.kept_back();
+        report.not_arriving = outbox.not_arriving();
+        report.announced_by_others = outbox.rivals();
         drop(outbox);
         report
     }

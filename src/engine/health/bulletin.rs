@@ -28,7 +28,7 @@ pub struct Bulletin {
 /// What is worth telling at once when it changes.
 #[derive(Debug, PartialEq)]
 struct Standing {
-    broker: [bool; 3],
+    broker: [bool; 4],
     buses: Vec<[bool; 3]>,
     devices: Vec<bool>,
     has_configuration_error: bool,
@@ -126,8 +126,8 @@ impl Standing {
     }
 }
 
-fn of_broker(broker: &BrokerReport) -> [bool; 3] {
-    [broker.connected, broker.client_id_taken, broker.state_denied]
+fn of_broker(broker: &BrokerReport) -> [bool; 4] {
+    [broker.connected, broker.client_id_taken, broker.state_denied, broker.misses_something()]
 }
 
 #[cfg(test)]
@@ -237,6 +237,8 @@ mod tests {
         };
         assert!(!bulletin.wants_report(at(1), &broker(false)));
         assert!(bulletin.wants_report(at(1), &broker(true)));
+        let missing = BrokerReport { not_arriving: vec!["busker/bridge/state".into()], ..broker(false) };
+        assert!(bulletin.wants_report(at(1), &missing));
     }
 
     #[test]

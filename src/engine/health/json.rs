@@ -66,6 +66,8 @@ impl GatewayReport {
                 "client_id_taken": self.broker.client_id_taken,
                 "state_denied": self.broker.state_denied,
                 "kept_back": self.broker.kept_back,
+                "not_arriving": self.broker.not_arriving,
+                "announced_by_others": self.broker.announced_by_others,
                 "waiting": self.broker.waiting,
                 "dropped": self.broker.dropped,
             },

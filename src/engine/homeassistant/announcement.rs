@@ -174,6 +174,23 @@ impl Announcement {
     }
 }
 
+/// The base topic of the gateway that has published this announcement; `None` where none like this one has.
+pub fn announcer(payload: &str) -> Option<String> {
+    // Most of what others announce is not taken apart.
+    if !payload.contains("/bridge/state") {
+        return None;
+    }
+    let announced: Value = serde_json::from_str(payload).ok()?;
+    if announced["origin"]["name"] != "busker" {
+        return None;
+    }
+    let available_by =
+        announced["availability"].as_array().into_iter().flatten().map(|entry| &entry["topic"]);
+    let components = announced["components"].as_object().into_iter().flatten();
+    let mut named = available_by.chain(components.map(|(_, component)| &component["state_topic"]));
+    named.find_map(|topic| Topics::base_of_state(topic.as_str()?)).map(str::to_string)
+}
+
 /// What decides of a component which values are right for it: Home Assistant logs a warning for a name that is no
 /// option, and for a number that is to be a moment.
 const MEANING: [&str; 8] = [

@@ -16,7 +16,7 @@ mod point;
 mod release;
 mod thing;
 
-pub use announcement::{Announcement, Gateway, Outline, farewell};
+pub use announcement::{Announcement, Gateway, Outline, announcer, farewell};
 pub use beside::companions;
 pub use device::announcement;
 pub use entity::Entity;

@@ -18,6 +18,7 @@ use std::fmt;
 
 use crate::engine::address::Span;
 use crate::engine::time::{Duration, Time};
+pub use crate::engine::value::exception_name;
 
 /// One question to one unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -184,22 +185,6 @@ impl RequestError {
             RequestError::Collision => Some("check who else speaks on the line"),
             RequestError::Exception(_) | RequestError::Link(_) | RequestError::Impossible(_) => None,
         }
-    }
-}
-
-/// The specification's words for an exception code.
-pub const fn exception_name(code: u8) -> &'static str {
-    match code {
-        1 => "illegal function",
-        2 => "illegal data address",
-        3 => "illegal data value",
-        4 => "device failure",
-        5 => "acknowledge",
-        6 => "device busy",
-        8 => "memory parity error",
-        10 => "gateway path unavailable",
-        11 => "gateway target failed to respond",
-        _ => "unknown exception",
     }
 }
 

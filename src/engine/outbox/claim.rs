@@ -62,6 +62,7 @@ impl Outbox {
         let Some(entry) = self.retained.get(&*topic) else { return };
         if *entry.payload == *payload {
             self.claim.due = None;
+            self.has_arrived(&topic, payload.len(), now);
         } else if !entry.queued && self.claim.denied(now) {
             self.tell_state_again();
         }
@@ -83,11 +84,7 @@ impl Outbox {
 
     fn tell_state_again(&mut self) {
         let topic = self.topics.bridge_state();
-        if let Some(entry) = self.retained.get_mut(&*topic) {
-            if !std::mem::replace(&mut entry.queued, true) {
-                self.queue_last(super::Queued::Newest(topic.into()));
-            }
-        }
+        self.tell_again(&topic);
     }
 }
 

@@ -11,7 +11,10 @@ impl Outbox {
     /// have any more is taken away properly; announcements that are not ours are left alone.
     pub fn found(&mut self, topic: &str, payload: &str) {
         let Some(found) = Announcement::parse(&self.topics, topic, payload) else {
-            return self.found_of_former(topic, payload);
+            if !self.found_of_former(topic, payload) {
+                self.found_of_rival(topic, payload);
+            }
+            return;
         };
         let is_gone = |topic: &&str| self.topics.are_above(topic) && !self.wanted.contains(*topic);
         for topic in found.told_on().into_iter().filter(is_gone) {

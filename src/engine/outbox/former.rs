@@ -68,6 +68,7 @@ impl Outbox {
 
     /// The broker listens to what this gateway asks: it tells now what it remembers.
     pub fn listens(&mut self, now: Time) {
+        self.watch_suspect(now);
         self.formers_due = (!self.formers.is_empty()).then(|| now + LISTEN_FOR);
     }
 
@@ -78,17 +79,24 @@ impl Outbox {
             return None;
         }
         self.is_left_to_others = true;
-        Some(self.formers.remove(at).tree.base_topic)
+        let former = self.formers.remove(at);
+        for found in former.announced {
+            self.found_of_rival(found.topic(), &found.message().payload);
+        }
+        Some(former.tree.base_topic)
     }
 
-    /// The broker remembers this announcement, which is not of the present base topic.
-    pub(super) fn found_of_former(&mut self, topic: &str, payload: &str) {
+    /// The broker remembers this announcement, which is not of the present base topic. Whether it is of one that
+    /// this gateway had.
+    pub(super) fn found_of_former(&mut self, topic: &str, payload: &str) -> bool {
         for former in &mut self.formers {
             if let Some(found) = Announcement::parse(&former.topics(), topic, payload) {
                 former.announced.retain(|other| other.topic() != topic);
                 former.announced.push(found);
+                return true;
             }
         }
+        false
     }
 
     /// The time of [`LISTEN_FOR`] may be over.

@@ -109,6 +109,15 @@ impl Queue {
         lane.remove(at)
     }
 
+    /// Drops all that concerns this topic.
+    pub(super) fn forget(&mut self, lane: Lane, topic: &str) {
+        let lane = self.lane(lane);
+        let before = lane.iter().filter(|queued| queued.is_once()).count();
+        lane.retain(|queued| queued.topic() != topic);
+        let after = lane.iter().filter(|queued| queued.is_once()).count();
+        self.once_waiting -= before - after;
+    }
+
     /// Takes everything.
     pub(super) fn take_all(&mut self) -> impl Iterator<Item = Queued> + use<> {
         let Queue { announcements, others, .. } = std::mem::take(self);

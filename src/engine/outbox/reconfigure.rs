@@ -37,6 +37,9 @@ impl Outbox {
         }
         let own = &self.own_devices;
         self.remembered.retain(|topic, _| own.contains(topic));
+        let is_told = |topic: &str| self.retained.contains_key(topic);
+        self.arriving.keep(is_told);
+        self.meet_rivals();
     }
 
     /// Something will be announced anew: what it has no more is buried then.

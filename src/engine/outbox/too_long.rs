@@ -2,9 +2,11 @@
 //! connection, and since everything is sent anew after a reconnect, the announcement of one large device would keep
 //! the whole gateway away for ever. So what was on its way when the broker closed the connection is remembered; the
 //! longest of it is sent last after the next reconnect, when everything else is there. If the connection ends with
-//! it once more, it is not sent again.
+//! it once more, it is not sent again. If the next connection holds although everything was sent, it was another
+//! reason that ended the one before.
 
 use super::Outbox;
+use crate::engine::time::{Duration, Time};
 
 /// No broker has a limit below that.
 const LONG: usize = 1024;
@@ -13,11 +15,16 @@ const LONG: usize = 1024;
 const TIMES: u32 = 3;
 const TIMES_MORE: u32 = 2;
 
+/// A broker that closes the connection for a message does it at once.
+const CLOSES_WITHIN: Duration = Duration::from_secs(10);
+
 #[derive(Clone, Debug, Default)]
 pub(super) struct TooLong {
     suspect: Option<Suspect>,
     /// A payload of so many bytes is too long.
     limit: Option<usize>,
+    /// If the connection still holds then, the suspect was none.
+    acquitted_at: Option<Time>,
 }
 
 /// The longest message that was on its way when the connection ended.
@@ -39,6 +46,15 @@ impl TooLong {
         suspect.is_some_and(|suspect| suspect.times + 1 >= self.times())
     }
 
+    pub(super) fn due(&self) -> Option<Time> {
+        self.acquitted_at
+    }
+
+    /// There is no connection that would hold.
+    pub(super) fn wait(&mut self) {
+        self.acquitted_at = None;
+    }
+
     fn times(&self) -> u32 {
         if self.limit.is_some() { TIMES_MORE } else { TIMES }
     }
@@ -58,6 +74,7 @@ impl Outbox {
             return false;
         }
         let too_long = &mut self.too_long;
+        too_long.wait();
         let before = too_long.suspect.take().filter(|suspect| suspect.topic == topic);
         let times = before.map_or(0, |suspect| suspect.times) + 1;
         if times < too_long.times() {
@@ -74,6 +91,28 @@ impl Outbox {
         self.too_long = TooLong::default();
     }
 
+    /// The broker listens, and is being sent what there is.
+    pub(super) fn watch_suspect(&mut self, now: Time) {
+        if self.too_long.suspect.is_some() {
+            self.too_long.acquitted_at = Some(now + CLOSES_WITHIN);
+        }
+    }
+
+    /// The time of [`TooLong::due`] may have come.
+    pub(super) fn wake_suspicion(&mut self, now: Time) {
+        if self.too_long.acquitted_at.is_none_or(|at| now < at) {
+            return;
+        }
+        if !self.is_empty() {
+            self.watch_suspect(now);
+            return;
+        }
+        // The connection before was lost for another reason, as with a broker that has started anew.
+        let kept_back = self.kept_back();
+        self.lost();
+        kept_back.iter().for_each(|topic| self.tell_again(topic));
+    }
+
     /// The topics of which the broker is not told what stands there, since it is too long.
     pub fn kept_back(&self) -> Vec<String> {
         if self.too_long.limit.is_none() {
@@ -86,7 +125,7 @@ impl Outbox {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::{outbox, retained, take_all};
+    use super::super::tests::{LATER, outbox, retained, take_all};
     use super::*;
 
     const ANNOUNCED: &str = "homeassistant/device/busker_boiler/config";
@@ -157,6 +196,45 @@ mod tests {
             other(&mut outbox);
             assert!(sent(&mut outbox).iter().any(|topic| topic == ANNOUNCED));
         }
+    }
+
+    #[test]
+    fn a_broker_that_came_back_at_once_with_another_limit_is_sent_what_was_kept_back() {
+        let mut outbox = filled();
+        while !outbox.closed_on(ANNOUNCED, 9000) {}
+        sent(&mut outbox);
+        // Killed as something shorter was on its way.
+        assert!(!outbox.closed_on(INFO, 2000));
+        outbox.disconnected();
+        sent(&mut outbox);
+        outbox.listens(LATER);
+        let due = outbox.wake_at().expect("the suspect is acquitted");
+        assert_eq!(due, LATER + CLOSES_WITHIN);
+        // It is not all sent yet.
+        retained(&mut outbox, "busker/boiler/flow", "22");
+        outbox.wake(due);
+        assert_eq!(outbox.kept_back(), [ANNOUNCED]);
+        assert_eq!(take_all(&mut outbox).len(), 1);
+        outbox.wake(due + CLOSES_WITHIN);
+        assert_eq!(outbox.kept_back(), [""; 0]);
+        assert!(take_all(&mut outbox).iter().any(|message| message.topic == ANNOUNCED));
+        assert_eq!(outbox.wake_at(), None);
+    }
+
+    #[test]
+    fn while_the_limit_is_the_same_nothing_is_tried_again_by_itself() {
+        let mut outbox = filled();
+        while !outbox.closed_on(ANNOUNCED, 9000) {}
+        sent(&mut outbox);
+        outbox.listens(LATER);
+        assert_eq!(outbox.wake_at(), None);
+        // Nor is a suspect acquitted that ends the connection again.
+        assert!(!outbox.closed_on(INFO, 2000));
+        sent(&mut outbox);
+        outbox.listens(LATER);
+        assert!(outbox.closed_on(INFO, 2000));
+        assert_eq!(outbox.wake_at(), None);
+        assert_eq!(outbox.kept_back(), [INFO, ANNOUNCED]);
     }
 
     #[test]

@@ -53,7 +53,8 @@ impl DeviceState {
                 self.paused_until = now + PAUSE_BUSY_LONG;
             }
             (Err(RequestError::Exception(code)), _) => {
-                let reason = format!("it answers its identification with exception {code}: another device?");
+                let exception = RequestError::Exception(code);
+                let reason = format!("it answers its identification with {exception}: another device?");
                 self.mistake(now, reason, context);
             }
             (Err(error), _) => self.failed(now, &error, context),
