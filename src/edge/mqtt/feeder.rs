@@ -40,6 +40,15 @@ pub enum News {
     },
 }
 
+/// What the feeder is asked to do.
+pub(super) enum Order {
+    /// To hear this from now on, and nothing else; and to say when the broker has confirmed it.
+    ListenTo(Arrivals, oneshot::Sender<()>),
+    /// To send what waits, and `offline`, and to disconnect. What waits is in this one, if the usual one is another
+    /// connection's by now.
+    End(Option<Arc<Mailbox>>),
+}
+
 /// Feeds the library from the outbox and hands on what comes in.
 pub(super) struct Feeder<Tell> {
     pub client: AsyncClient,
@@ -54,7 +63,16 @@ pub(super) struct Feeder<Tell> {
     pub contested: bool,
     /// What was last told of the connection.
     pub told_up: Option<bool>,
-    pub subscribed: bool,
+    /// What is still to be subscribed to.
+    pub wanted: Vec<String>,
+    /// What the broker was asked for last.
+    pub asked_for: Vec<String>,
+    /// Who wants to know when it has answered.
+    pub awaits_answer: Option<oneshot::Sender<()>>,
+    /// What was listened to before on this connection: it may be on its way still.
+    pub before: Option<Arrivals>,
+    /// What is still to be let go of.
+    pub unwanted: Vec<String>,
     pub ending: bool,
     /// Whether it was told that others tell something else of this gateway's state.
     pub denied: bool,
@@ -62,7 +80,7 @@ pub(super) struct Feeder<Tell> {
 }
 
 impl<Tell: Fn(News)> Feeder<Tell> {
-    pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut goodbye: oneshot::Receiver<()>) {
+    pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut orders: mpsc::Receiver<Order>) {
         loop {
             let wake_at = self.mailbox.outbox().wake_at().into_iter().chain(self.asks_at()).min();
             let until = wake_at.map_or(Duration::from_secs(3600), |time| self.clock.until(time));
@@ -73,10 +91,14 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 },
                 () = self.mailbox.news.notified() => {}
                 () = tokio::time::sleep(until) => self.mailbox.outbox().wake(self.clock.now()),
-                _ = &mut goodbye, if !self.ending => {
-                    self.ending = true;
-                    self.mailbox.outbox().goodbye();
-                }
+                order = orders.recv(), if !self.ending => match order {
+                    Some(Order::ListenTo(arrivals, told)) => self.listen_to(arrivals, told),
+                    Some(Order::End(rest)) => {
+                        self.mailbox = rest.unwrap_or(self.mailbox);
+                        self.end();
+                    }
+                    None => self.end(),
+                },
             }
             if self.ending && !self.connected {
                 return;
@@ -88,6 +110,26 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         }
     }
 
+    fn end(&mut self) {
+        self.ending = true;
+        self.mailbox.outbox().goodbye();
+    }
+
+    /// On the same connection: what stays is not asked for again.
+    fn listen_to(&mut self, arrivals: Arrivals, told: oneshot::Sender<()>) {
+        let before = std::mem::replace(&mut self.arrivals, arrivals);
+        let now = self.arrivals.filters();
+        self.wanted.retain(|filter| now.contains(filter));
+        self.unwanted.retain(|filter| !now.contains(filter));
+        let (stays, goes): (Vec<&String>, Vec<&String>) =
+            before.filters().iter().partition(|filter| now.contains(filter));
+        self.wanted.extend(now.iter().filter(|filter| !stays.contains(filter)).cloned());
+        self.unwanted.extend(goes.into_iter().cloned());
+        // Whoever waits waits no longer where nothing is asked, or nobody could answer.
+        self.awaits_answer = (self.connected && !self.wanted.is_empty()).then_some(told);
+        self.before = Some(before);
+    }
+
     fn handle(&mut self, seen: Seen) {
         match seen {
             Seen::Up => {
@@ -97,7 +139,9 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 state.reason = None;
                 state.connects += 1;
                 drop(state);
-                (self.connected, self.subscribed) = (true, false);
+                self.connected = true;
+                (self.wanted, self.unwanted) = (self.arrivals.filters().to_vec(), Vec::new());
+                self.before = None;
                 self.mailbox.outbox().connected();
                 self.told_up = Some(true);
                 (self.tell)(News::Up);
@@ -114,7 +158,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.contested = contested;
                 state.reason = Some(reason);
                 drop(state);
-                self.connected = false;
+                (self.connected, self.awaits_answer) = (false, None);
                 self.mailbox.outbox().disconnected();
                 self.judge_length(closed_on);
                 if self.told_up != Some(false) {
@@ -134,7 +178,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 });
             }
             Seen::Packet { packet: Packet::SubAck(answer), .. } => {
-                let codes = answer.return_codes.iter().zip(self.arrivals.filters());
+                let codes = answer.return_codes.iter().zip(&self.asked_for);
                 let refused = codes.filter(|(code, _)| **code == SubscribeReasonCode::Failure);
                 let refused: Vec<&str> = refused.map(|(_, filter)| filter.as_str()).collect();
                 if !refused.is_empty() {
@@ -145,6 +189,10 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                     );
                 }
                 self.mailbox.outbox().listens(self.clock.now());
+                if let Some(told) = self.awaits_answer.take() {
+                    // Perhaps nobody waits any more.
+                    let _ = told.send(());
+                }
             }
             Seen::Packet { .. } | Seen::Room => {}
         }
@@ -164,9 +212,16 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         }
     }
 
+    fn sort<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
+        match (self.arrivals.sort(mail), &self.before) {
+            (Arrival::Nothing, Some(before)) => before.sort(mail),
+            (arrival, _) => arrival,
+        }
+    }
+
     fn receive(&mut self, mail: &Mail<'_>) {
         let Mail { topic, payload, retained, .. } = *mail;
-        match self.arrivals.sort(mail) {
+        match self.sort(mail) {
             // The last word is this gateway's own, when it ends.
             Arrival::OwnState if self.ending => {}
             Arrival::OwnState => self.heard_state(payload),
@@ -220,7 +275,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
 
     /// When the broker is asked next whether it is there.
     fn asks_at(&self) -> Option<Time> {
-        if self.connected && self.subscribed { lock(&self.connection).asks_at() } else { None }
+        if self.connected && self.wanted.is_empty() { lock(&self.connection).asks_at() } else { None }
     }
 
     /// Asks what a broker answers and nobody else hears of: to be told no more of what this gateway was never told
@@ -240,13 +295,13 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         if !self.connected {
             return false;
         }
-        if !self.subscribed {
-            let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
-            self.subscribed =
-                self.client.try_subscribe_many(self.arrivals.filters().iter().map(filter)).is_ok();
-        }
+        self.subscribe();
         self.ask();
         let mut outbox = self.mailbox.outbox();
+        if !outbox.is_connected() {
+            // It is for another connection, which follows this one.
+            return false;
+        }
         while let Some(message) = outbox.next_message(self.clock.now()) {
             let Manner { confirmed, retain } = outbox.manner(&message);
             let qos = if confirmed { QoS::AtLeastOnce } else { QoS::AtMostOnce };
@@ -256,7 +311,23 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 return false;
             }
         }
-        self.subscribed && outbox.is_empty()
+        self.wanted.is_empty() && outbox.is_empty()
+    }
+
+    fn subscribe(&mut self) {
+        if !self.wanted.is_empty() {
+            let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
+            if self.client.try_subscribe_many(self.wanted.iter().map(filter)).is_ok() {
+                self.asked_for = std::mem::take(&mut self.wanted);
+            }
+        }
+        // Where the library has no room, it is tried again when it has.
+        while let Some(filter) = self.unwanted.last() {
+            if self.client.try_unsubscribe(filter).is_err() {
+                return;
+            }
+            self.unwanted.pop();
+        }
     }
 
     /// Waits until the library has sent everything and the connection is closed.
