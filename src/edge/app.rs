@@ -18,7 +18,7 @@ use crate::edge::reports::{Detail, Reporter, Watched};
 use crate::edge::runtime::Runtime;
 use crate::edge::secrets::Secrets;
 use crate::edge::shutdown::{self, Heard, Signals};
-use crate::edge::state_files::StateFiles;
+use crate::edge::state_files::{Shelf, StateFiles};
 use crate::engine::health::{self, Bulletin, GatewayReport};
 use crate::engine::homeassistant;
 use crate::engine::profile::Library;
@@ -38,7 +38,7 @@ pub struct App {
     pub(super) keys: Keys,
     pub(super) http: Option<Http>,
     pub(super) reporter: Arc<Reporter>,
-    pub(super) state: Arc<StateFiles>,
+    pub(super) state: Arc<Shelf>,
     pub(super) threads: Threads,
     pub(super) watch: JoinHandle<()>,
 }
@@ -71,14 +71,14 @@ impl App {
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
         let runtime = Runtime::start().context("the runtime cannot be started")?;
         let clock = Clock::start();
-        let state = Arc::new(state);
+        let state = Arc::new(Shelf::new(state));
         // What can fail comes before what cannot.
         let listener = match &settings.http.listen {
             Some(listen) => Some(runtime.block_on(Http::bind(listen))?),
             None => None,
         };
         let plant = Arc::new(Plant::new(settings, library, clock));
-        recall(&plant, &state);
+        recall(&plant, &state.now());
         introduce(&plant.settings(), &plant.mailbox());
         let everyone = 0..plant.settings().buses.len();
         let threads = Threads::new(plant.stir().clone());
@@ -121,13 +121,13 @@ impl App {
         self.watch.abort();
         end_buses(&self.runtime, self.plant.buses());
         if let Some(broker) = self.broker {
-            self.runtime.block_on(broker.finish());
+            self.runtime.block_on(broker.finish(None));
         }
         if let Some(http) = self.http {
             http.stop();
         }
         drop(self.runtime);
-        self.state.finish();
+        self.state.now().finish();
     }
 }
 
@@ -169,7 +169,7 @@ pub(super) fn start_buses(
     plant: &Plant,
     which: impl IntoIterator<Item = usize>,
     clock: Clock,
-    state: &Arc<StateFiles>,
+    state: &Arc<Shelf>,
 ) -> anyhow::Result<Vec<Arc<BusHandle>>> {
     let settings = plant.settings();
     let mut buses: Vec<Arc<BusHandle>> = Vec::new();
@@ -191,7 +191,7 @@ pub(super) fn start_bus(
     settings: &Arc<Settings>,
     index: usize,
     clock: Clock,
-    state: &Arc<StateFiles>,
+    state: &Arc<Shelf>,
     mailbox: Arc<Mailbox>,
 ) -> anyhow::Result<Arc<BusHandle>> {
     let publish = Box::new(move |message| mailbox.push(message));
@@ -242,13 +242,13 @@ pub(super) fn watched(buses: &[Arc<BusHandle>]) -> Vec<Arc<Watched>> {
 
 /// Looks at the gateway when something stirs, and now and then when nothing does: tells its health, and feeds
 /// systemd's watchdog while every bus answers.
-pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc<StateFiles>) {
+pub(super) async fn watch(reporter: Arc<Reporter>, plant: Arc<Plant>, state: Arc<Shelf>) {
     let clock = plant.clock();
     let mut bulletin = Bulletin::new(&plant.settings(), shutdown::watchdog_interval());
     let mut has_stirred = true;
     loop {
         let now = clock.now();
-        store_what_is_told(&plant, &state, now);
+        store_what_is_told(&plant, &state.now(), now);
         let wants_report = has_stirred || bulletin.wants_report(now, &plant.broker());
         let all_respond = if !wants_report && reporter.all_respond().await {
             true

@@ -12,7 +12,7 @@ use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::{Link, Lost};
 use crate::edge::recordings;
-use crate::edge::state_files::StateFiles;
+use crate::edge::state_files::Shelf;
 use crate::edge::stir::Stir;
 use crate::engine::bus::{Action, Bus, Event, Inbox, STOPPING, Severity};
 use crate::engine::health::BusReport;
@@ -64,7 +64,7 @@ pub(super) struct BusRunner {
     settings: Arc<Settings>,
     index: usize,
     clock: Clock,
-    state: Arc<StateFiles>,
+    state: Arc<Shelf>,
     publish: Box<dyn Fn(Message) + Send>,
     /// What is to be published when the thread has time for it.
     outgoing: Vec<Message>,
@@ -90,11 +90,11 @@ impl BusRunner {
         settings: Arc<Settings>,
         index: usize,
         clock: Clock,
-        state: Arc<StateFiles>,
+        state: Arc<Shelf>,
         publish: Box<dyn Fn(Message) + Send>,
         ears: Ears,
     ) -> BusRunner {
-        let bus = Bus::new(clock.now(), &settings, index, &state.memories());
+        let bus = Bus::new(clock.now(), &settings, index, &state.now().memories());
         let Ears { inbox, looks, bell, stop, stir, ended } = ears;
         BusRunner {
             settings,
@@ -233,7 +233,7 @@ impl BusRunner {
                     }
                     self.outgoing.push(message);
                 }
-                Action::Store(record) => self.state.store(record),
+                Action::Store(record) => self.state.now().store(record),
                 Action::Record { recording, request, keep } => self.record(*recording, request, keep),
                 Action::Reopen { after } => {
                     self.port = Port::Waiting(self.clock.now() + after);
@@ -261,6 +261,8 @@ impl BusRunner {
             self.bell.ring();
         }
         while let Ok(look) = self.looks.try_recv() {
+            // Whoever looks takes for told what has happened until then.
+            self.publish();
             look(&self.bus, self.clock.now());
         }
     }
@@ -321,7 +323,7 @@ impl BusRunner {
     fn record(&mut self, recording: Recording, request: Option<Request>, keep: usize) {
         self.saving.retain(|saving| !saving.is_finished());
         let (inbox, bell, clock) = (self.inbox.clone(), self.bell.clone(), self.clock);
-        let folder = self.state.recordings().map(Path::to_path_buf);
+        let folder = self.state.now().recordings().map(Path::to_path_buf);
         let asked = request.clone();
         let saving = std::thread::Builder::new().name("recording".into()).spawn(move || {
             let result = match folder {

@@ -21,7 +21,7 @@ use crate::edge::clock::Clock;
 use crate::edge::guarded_link::{Woken, wait};
 use crate::edge::link::{Lost, timespec};
 use crate::edge::punctual::Punctual;
-use crate::edge::state_files::StateFiles;
+use crate::edge::state_files::Shelf;
 use crate::edge::stir::Stir;
 use crate::engine::bus::{Bus, Command, Event, Full, Inbox};
 use crate::engine::health::BusReport;
@@ -104,7 +104,7 @@ impl Threads {
         settings: Arc<Settings>,
         index: usize,
         clock: Clock,
-        state: Arc<StateFiles>,
+        state: Arc<Shelf>,
         publish: Box<dyn Fn(Message) + Send>,
     ) -> std::io::Result<BusHandle> {
         let inbox = Arc::<Mutex<Inbox>>::default();

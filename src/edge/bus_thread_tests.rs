@@ -11,6 +11,7 @@ use std::task::{Context, Waker};
 use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 
 use super::*;
+use crate::edge::state_files::StateFiles;
 use crate::engine::configuration;
 use crate::engine::modbus::crc::crc;
 use crate::engine::profile::Library;
@@ -38,8 +39,8 @@ fn line() -> (OwnedFd, String) {
     (far, path)
 }
 
-fn nowhere() -> Arc<StateFiles> {
-    Arc::new(StateFiles::nowhere())
+fn nowhere() -> Arc<Shelf> {
+    Arc::new(Shelf::new(StateFiles::nowhere()))
 }
 
 fn run(settings: Arc<Settings>) -> (BusHandle, Receiver<Message>) {

@@ -34,19 +34,19 @@ struct Parts {
     connection: Option<BrokerState>,
 }
 
+/// Of a gateway with these settings that has told nothing yet.
+pub(super) fn outbox(settings: &Settings) -> Outbox {
+    let (topics, home_assistant) = (Topics::of(&settings.mqtt), &settings.home_assistant);
+    let identities = homeassistant::identities(settings);
+    Outbox::new(topics, &home_assistant.prefix, identities).with_values(settings.mqtt.values)
+}
+
 impl Parts {
     fn new(settings: Settings, library: Library) -> Parts {
-        let topics = Topics::of(&settings.mqtt);
-        let outbox = Outbox::new(
-            topics.clone(),
-            &settings.home_assistant.prefix,
-            homeassistant::identities(&settings),
-        )
-        .with_values(settings.mqtt.values);
         Parts {
             desk: Desk::new(&settings, library),
-            topics,
-            mailbox: Arc::new(Mailbox::new(outbox)),
+            topics: Topics::of(&settings.mqtt),
+            mailbox: Arc::new(Mailbox::new(outbox(&settings))),
             buses: Vec::new(),
             connection: None,
             settings: Arc::new(settings),
@@ -60,15 +60,11 @@ impl Plant {
         Plant { clock, stir: Arc::default(), parts: Mutex::new(Parts::new(settings, library)) }
     }
 
-    /// The same once more, with an empty mailbox.
-    pub fn begin_anew(&self, settings: Settings, library: Library) {
-        *self.parts() = Parts::new(settings, library);
-    }
-
     /// The same mailbox and connection, and other settings.
     pub fn exchange(&self, settings: Settings, library: Library, buses: Vec<Arc<BusHandle>>) {
         let mut parts = self.parts();
         parts.desk = Desk::new(&settings, library);
+        parts.topics = Topics::of(&settings.mqtt);
         parts.settings = Arc::new(settings);
         parts.buses = buses;
     }
@@ -96,10 +92,6 @@ impl Plant {
 
     pub fn mailbox(&self) -> Arc<Mailbox> {
         self.parts().mailbox.clone()
-    }
-
-    pub fn topics(&self) -> Topics {
-        self.parts().topics.clone()
     }
 
     pub fn buses(&self) -> Vec<Arc<BusHandle>> {

@@ -1,26 +1,28 @@
 //! A new configuration while the gateway runs: only what has changed ends, begins or begins anew.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use anyhow::Context;
 
 use crate::edge::app::{
-    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, start_buses,
-    watch, watched,
+    App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, watch, watched,
 };
 use crate::edge::bus_thread::BusHandle;
 use crate::edge::http::{Bound, Http};
+use crate::edge::mqtt::Mailbox;
+use crate::edge::plant;
 use crate::edge::reports::Reporter;
 use crate::edge::secrets::Secrets;
 use crate::edge::state_files::StateFiles;
-use crate::engine::bus::Event;
+use crate::engine::bus::{self, Bus, Event};
 use crate::engine::homeassistant;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
-use crate::engine::reload::{self, Change, Fate, Parts};
+use crate::engine::reload::{self, Change, Fate, Telling};
 use crate::engine::settings::{DeviceSettings, Settings};
 use crate::engine::time::Duration;
+use crate::engine::topics::Topics;
 
 /// How often a bus is asked whether a device has left it.
 const ASK_EVERY: Duration = Duration::from_millis(5);
@@ -32,7 +34,7 @@ impl App {
         // What can fail comes before what cannot.
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
         let old = self.plant.settings();
-        let change = reload::compare(&old, &settings);
+        let mut change = reload::compare(&old, &settings);
         // The same port can be taken only when it has been left.
         let port = self.http_address().map(|address| format!(":{}", address.port()));
         let is_its_own = |listen: &String| port.as_ref().is_some_and(|port| listen.ends_with(port));
@@ -47,25 +49,21 @@ impl App {
             true => None,
             false => Some(StateFiles::open(&settings.state_dir, names())?),
         };
+        let is_kept = |state: &StateFiles| state.memories().unkept.is_none();
+        if state.as_ref().is_some_and(|state| !is_kept(state) || !is_kept(&self.state.now())) {
+            change.every_device_begins_anew(&old, &settings);
+        }
         let http_ends = old.http != settings.http || keys.token != self.keys.token;
         let listen = settings.http.listen.clone();
-        match change {
-            Change::Everything => {
-                tracing::info!("the new configuration changes what everything is made of: all begins anew");
-                self.begin_anew(state, settings, library, keys, secrets)?;
-            }
-            Change::Parts(parts) => {
-                if parts.is_nothing() && keys == self.keys {
-                    tracing::info!("the new configuration changes nothing that runs");
-                }
-                self.exchange(&old, settings, library, &parts)?;
-                let reconnects = parts.broker || !keys.is_same_broker(&self.keys);
-                self.keys = keys;
-                if reconnects {
-                    tracing::info!("the connection to the broker is made anew");
-                    self.reconnect(secrets);
-                }
-            }
+        if change.is_nothing() && keys == self.keys {
+            tracing::info!("the new configuration changes nothing that runs");
+        }
+        self.exchange(&old, settings, library, state, &change)?;
+        let reconnects = change.broker || !keys.is_same_broker(&self.keys);
+        self.keys = keys;
+        if reconnects {
+            tracing::info!("the connection to the broker is made anew");
+            self.reconnect(secrets);
         }
         if http_ends {
             self.exchange_http(listener, listen.as_deref())?;
@@ -81,64 +79,18 @@ impl App {
         self.plant.stir().stir();
     }
 
-    fn begin_anew(
-        &mut self,
-        state: Option<StateFiles>,
-        settings: Settings,
-        library: Library,
-        keys: Keys,
-        secrets: Secrets,
-    ) -> anyhow::Result<()> {
-        let _change = Reporter::change(&self.reporter);
-        self.reporter.replace(Vec::new());
-        end_buses(&self.runtime, self.plant.buses());
-        let (old, mailbox) = (self.plant.settings(), self.plant.mailbox());
-        let announced = mailbox.change(Outbox::take_back_everything);
-        if let Some(broker) = self.broker.take() {
-            self.runtime.block_on(broker.finish());
-        }
-        let (announced, trees) =
-            mailbox.look(|outbox| outbox.legacy(announced, reload::topics_of_devices(&old)));
-        match state {
-            Some(state) => {
-                self.state.finish();
-                self.state = Arc::new(state);
-            }
-            None => drop(self.state.learn(settings.devices.iter().map(|device| device.name.as_str()))),
-        }
-        // What it has told has been taken back.
-        self.watch.abort();
-        {
-            let _inside = self.runtime.enter();
-            let watch = watch(self.reporter.clone(), self.plant.clone(), self.state.clone());
-            self.watch = tokio::spawn(watch);
-        }
-        let everyone = 0..settings.buses.len();
-        let wanted = reload::topics_of_devices(&settings);
-        self.plant.begin_anew(settings, library);
-        self.plant.mailbox().change(|outbox| outbox.recall(announced, trees, &wanted));
-        remember_topics(&self.plant, &self.state);
-        introduce(&self.plant.settings(), &self.plant.mailbox());
-        let buses = start_buses(&self.threads, &self.plant, everyone, self.clock, &self.state)?;
-        self.plant.set_buses(buses.clone());
-        self.keys = keys;
-        let _inside = self.runtime.enter();
-        self.broker = Some(connect(&self.plant, secrets, self.clock));
-        self.reporter.replace(watched(&buses));
-        Ok(())
-    }
-
     fn exchange(
         &mut self,
         old: &Settings,
         settings: Settings,
         library: Library,
-        parts: &Parts,
+        state: Option<StateFiles>,
+        change: &Change,
     ) -> anyhow::Result<()> {
         let before = old.buses.iter().map(|bus| bus.name.clone()).zip(self.plant.buses());
         let mut running: BTreeMap<String, Arc<BusHandle>> = before.collect();
         let stays = |name: &str| {
-            let mut fates = parts.buses.iter();
+            let mut fates = change.buses.iter();
             fates.any(|(bus, fate)| bus == name && matches!(fate, Fate::Stays { .. }))
         };
         let _change = Reporter::change(&self.reporter);
@@ -147,23 +99,29 @@ impl App {
         let ending: Vec<String> = running.keys().filter(|name| !stays(name)).cloned().collect();
         let ended = ending.iter().filter_map(|name| running.remove(name)).collect();
         end_buses(&self.runtime, ended);
-        for (name, fate) in &parts.buses {
+        for (name, fate) in &change.buses {
             if let (Fate::Stays { leave, .. }, Some(bus)) = (fate, running.get(name)) {
                 self.retire(bus, leave);
             }
         }
-        self.take_back(old, &settings);
+        if let Some(state) = state {
+            self.state.exchange(state);
+        }
+        if change.telling != Telling::AsBefore {
+            self.tell_otherwise(old, &settings, change.telling, running.values());
+        }
+        self.take_back(old, &settings, change.telling);
 
         // What was on other buses may come to a bus only now that it has left those.
         let settings_of_threads = Arc::new(settings.clone());
         let names = settings.devices.iter().map(|device| device.name.as_str());
-        let memories = self.state.learn(names);
+        let memories = self.state.now().learn(names);
         let is_connected = self.plant.broker().connected;
         let mut buses = Vec::new();
-        for (index, (name, fate)) in parts.buses.iter().enumerate() {
+        for (index, (name, fate)) in change.buses.iter().enumerate() {
             let bus = match (fate, running.remove(name)) {
                 (Fate::Stays { come, .. }, Some(bus)) => {
-                    if let Some(rules) = parts.rules {
+                    if let Some(rules) = change.rules {
                         self.hand_over(&bus, Event::Rules(rules));
                     }
                     if !come.is_empty() {
@@ -197,16 +155,71 @@ impl App {
         }
         let watched = watched(&buses);
         self.plant.exchange(settings, library, buses);
-        remember_topics(&self.plant, &self.state);
+        remember_topics(&self.plant, &self.state.now());
         self.reporter.replace(watched);
-        if parts.rules.is_some() {
+        if change.telling != Telling::AsBefore || change.memory {
+            self.look_anew();
+        }
+        if change.rules.is_some() {
             tracing::info!("what holds for every bus has changed, and the buses go on");
         }
-        for (name, fate) in &parts.buses {
+        for (name, fate) in &change.buses {
             tell_fate(name, fate);
         }
-        parts.ended.iter().for_each(|name| tracing::info!("bus {name}: gone"));
+        change.ended.iter().for_each(|name| tracing::info!("bus {name}: gone"));
         Ok(())
+    }
+
+    /// Lets the buses that stay tell what is known as the new settings want it. They lose nothing by it.
+    fn tell_otherwise<'b>(
+        &mut self,
+        old: &Settings,
+        new: &Settings,
+        telling: Telling,
+        staying: impl Iterator<Item = &'b Arc<BusHandle>> + Clone,
+    ) {
+        let mailbox = self.plant.mailbox();
+        if telling == Telling::Elsewhere {
+            self.leave_base_topic(old, new);
+        } else {
+            let wanted = reload::topics_of_devices(new);
+            mailbox.change(|outbox| outbox.tell_otherwise(new, &wanted));
+            if let Some(broker) = &self.broker {
+                self.runtime.block_on(broker.listen_to(new));
+            }
+        }
+        introduce(new, &mailbox);
+        let wanted = bus::Telling::of(new);
+        for bus in staying.clone() {
+            self.hand_over(bus, Event::Telling(wanted.clone()));
+        }
+        for bus in staying {
+            let wanted = wanted.clone();
+            if !self.wait_until(bus, move |bus| bus.tells_as(&wanted)) {
+                tracing::warn!("a bus does not tell in time what it knows");
+            }
+        }
+    }
+
+    /// Takes back everything that this gateway has told below its base topic, and leaves the broker. What is put into
+    /// the mailbox from now on is for the new one.
+    fn leave_base_topic(&mut self, old: &Settings, new: &Settings) {
+        let mailbox = self.plant.mailbox();
+        let rest = Arc::new(Mailbox::new(mailbox.exchange(plant::outbox(new))));
+        let announced = rest.change(Outbox::take_back_everything);
+        if let Some(broker) = self.broker.take() {
+            self.runtime.block_on(broker.finish(Some(rest.clone())));
+        }
+        let (told_on, wanted) = (reload::topics_of_devices(old), reload::topics_of_devices(new));
+        let (announced, trees) = rest.look(|outbox| outbox.legacy(announced, told_on));
+        mailbox.change(|outbox| outbox.recall(announced, trees, &wanted));
+    }
+
+    /// Whoever looks at the gateway now and then takes nothing for told.
+    fn look_anew(&mut self) {
+        self.watch.abort();
+        let _inside = self.runtime.enter();
+        self.watch = tokio::spawn(watch(self.reporter.clone(), self.plant.clone(), self.state.clone()));
     }
 
     /// Lets devices leave a bus, and waits until the last of them has.
@@ -215,24 +228,24 @@ impl App {
             self.hand_over(bus, Event::Retire(device.clone()));
         }
         let names = devices.to_vec();
-        let left = self.runtime.block_on(async {
-            tokio::time::timeout(BUSES_END_WITHIN, async {
-                loop {
-                    let names = names.clone();
-                    let is_there = move |name: &String, bus: &crate::engine::bus::Bus| bus.has_device(name);
-                    let answer = bus.inspect(move |bus, _| names.iter().any(|name| is_there(name, bus)));
-                    // A bus that has ended has no devices.
-                    if !answer.await.unwrap_or(false) {
-                        return;
-                    }
-                    tokio::time::sleep(ASK_EVERY).await;
-                }
-            })
-            .await
-        });
-        if left.is_err() {
+        if !self.wait_until(bus, move |bus| !names.iter().any(|name| bus.has_device(name))) {
             tracing::warn!("a device does not leave its bus in time: {}", devices.join(", "));
         }
+    }
+
+    /// Waits until the bus is so, or has ended; `false` if that takes too long.
+    fn wait_until(&self, bus: &BusHandle, is_so: impl Fn(&Bus) -> bool + Clone + Send + 'static) -> bool {
+        let waits = async {
+            loop {
+                let is_so = is_so.clone();
+                let answer = bus.inspect(move |bus, _| is_so(bus));
+                if answer.await.unwrap_or(true) {
+                    return;
+                }
+                tokio::time::sleep(ASK_EVERY).await;
+            }
+        };
+        self.runtime.block_on(async { tokio::time::timeout(BUSES_END_WITHIN, waits).await.is_ok() })
     }
 
     fn hand_over(&self, bus: &BusHandle, event: Event) {
@@ -242,9 +255,14 @@ impl App {
     }
 
     /// Takes back at the broker what the new settings do not have.
-    fn take_back(&self, old: &Settings, new: &Settings) {
-        let topics = self.plant.topics();
-        let (before, wanted) = (reload::topics_of_devices(old), reload::topics_of_devices(new));
+    fn take_back(&self, old: &Settings, new: &Settings, telling: Telling) {
+        let topics = Topics::of(&new.mqtt);
+        let before = match telling {
+            // Has been taken back, as far as it could be.
+            Telling::Elsewhere => BTreeSet::new(),
+            Telling::AsBefore | Telling::Otherwise => reload::topics_of_devices(old),
+        };
+        let wanted = reload::topics_of_devices(new);
         let changed = reload::changed_devices(old, new);
         self.plant.mailbox().change(|outbox| {
             outbox.reconfigure(homeassistant::identities(new), &before, &wanted);
@@ -256,7 +274,7 @@ impl App {
 
     fn reconnect(&mut self, secrets: Secrets) {
         if let Some(broker) = self.broker.take() {
-            self.runtime.block_on(broker.finish());
+            self.runtime.block_on(broker.finish(None));
         }
         let _inside = self.runtime.enter();
         self.broker = Some(connect(&self.plant, secrets, self.clock));

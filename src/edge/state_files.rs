@@ -2,6 +2,7 @@
 //! the broker has been told.
 
 mod claim;
+mod shelf;
 mod writer;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -18,6 +19,7 @@ use crate::edge::lock::lock;
 use crate::engine::memory::{Memories, Memory, Record};
 use crate::engine::outbox::Tree;
 use claim::lock_folder;
+pub use shelf::Shelf;
 use writer::Writer;
 
 /// What Home Assistant has been told of this gateway, in `state_dir`.
@@ -144,6 +146,14 @@ impl StateFiles {
         }
         let unkept = unkept.or_else(|| memories.unkept.clone());
         Memories { unkept, ..memories.clone() }
+    }
+
+    /// Goes on from what the others remember, where both are kept.
+    fn take_over(&self, others: &StateFiles) {
+        let theirs = others.memories();
+        if theirs.unkept.is_none() {
+            theirs.devices.into_iter().for_each(|(device, memory)| self.store(Record { device, memory }));
+        }
     }
 
     /// Puts a memory where it will be stored. Does not wait for that.

@@ -268,6 +268,11 @@ impl Outbox {
         self.states_due_at = None;
     }
 
+    /// Whether the broker is there for what this one holds.
+    pub fn is_connected(&self) -> bool {
+        self.is_connected
+    }
+
     /// The connection is lost, or not made yet.
     pub fn disconnected(&mut self) {
         self.is_connected = false;

@@ -7,24 +7,29 @@ use crate::engine::topics::Topics;
 
 /// What has to be done so that the gateway is as the new settings want it.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Change {
-    /// What all topics and announcements are made of has changed, or where things are remembered:
-    /// everything begins anew.
-    Everything,
-    Parts(Parts),
-}
-
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Parts {
+pub struct Change {
     /// The connection to the broker is made anew.
     pub broker: bool,
     pub http: bool,
+    pub telling: Telling,
+    /// Where things are remembered.
+    pub memory: bool,
     /// What buses that stay go on with, if it has changed.
     pub rules: Option<Rules>,
     /// In the order of the new settings.
     pub buses: Vec<(String, Fate)>,
     /// Buses that are there no more.
     pub ended: Vec<String>,
+}
+
+/// How what is known is told from now on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Telling {
+    AsBefore,
+    /// On other topics below the same base topic, in another way, or to Home Assistant elsewhere or otherwise.
+    Otherwise,
+    /// Below another base topic: to everybody this is another gateway.
+    Elsewhere,
 }
 
 /// What becomes of a bus.
@@ -40,11 +45,23 @@ pub enum Fate {
     Begins,
 }
 
-impl Parts {
+impl Change {
+    /// What a device goes on with from memory is not so any more: each leaves its bus and comes to it again.
+    pub fn every_device_begins_anew(&mut self, old: &Settings, new: &Settings) {
+        for (bus, fate) in &mut self.buses {
+            if let Fate::Stays { leave, come } = fate {
+                *leave = devices_on(old, bus).into_iter().map(|device| device.name).collect();
+                *come = devices_on(new, bus);
+            }
+        }
+    }
+
     pub fn is_nothing(&self) -> bool {
         let stays = |(_, fate): &(String, Fate)| matches!(fate, Fate::Stays { leave, come } if leave.is_empty() && come.is_empty());
         !self.broker
             && !self.http
+            && !self.memory
+            && self.telling == Telling::AsBefore
             && self.rules.is_none()
             && self.ended.is_empty()
             && self.buses.iter().all(stays)
@@ -53,14 +70,15 @@ impl Parts {
 
 /// Compares two configurations.
 pub fn compare(old: &Settings, new: &Settings) -> Change {
-    let concerns_all = |settings: &Settings| {
+    let telling = |settings: &Settings| {
         let mqtt = &settings.mqtt;
-        let topics = (mqtt.base_topic.clone(), mqtt.topics.clone(), mqtt.values.retain, mqtt.json);
-        (topics, settings.home_assistant.clone(), settings.state_dir.clone())
+        (mqtt.topics.clone(), mqtt.values, mqtt.json, settings.home_assistant.clone())
     };
-    if concerns_all(old) != concerns_all(new) {
-        return Change::Everything;
-    }
+    let telling = match telling(old) != telling(new) {
+        _ if old.mqtt.base_topic != new.mqtt.base_topic => Telling::Elsewhere,
+        true => Telling::Otherwise,
+        false => Telling::AsBefore,
+    };
     let fate = |bus: &Bus| match old.buses.iter().find(|other| other.name == bus.name) {
         None => Fate::Begins,
         Some(before) if before != bus => Fate::Restarts,
@@ -75,13 +93,15 @@ pub fn compare(old: &Settings, new: &Settings) -> Change {
         }
     };
     let is_gone = |bus: &&Bus| !new.buses.iter().any(|other| other.name == bus.name);
-    Change::Parts(Parts {
-        broker: old.mqtt != new.mqtt,
+    Change {
+        broker: !old.mqtt.is_reached_as(&new.mqtt),
         http: old.http != new.http,
+        telling,
+        memory: old.state_dir != new.state_dir,
         rules: (old.rules() != new.rules()).then(|| new.rules()),
         buses: new.buses.iter().map(|bus| (bus.name.clone(), fate(bus))).collect(),
         ended: old.buses.iter().filter(is_gone).map(|bus| bus.name.clone()).collect(),
-    })
+    }
 }
 
 /// The devices on a bus, whatever number that has.
@@ -145,29 +165,30 @@ devices:
             assert!(text.contains(from), "{from}");
             text = text.replace(from, to);
         }
-        let told = match compare(&settings(BEFORE), &settings(&text)) {
-            Change::Everything => "everything".into(),
-            Change::Parts(parts) => {
-                let mut words: Vec<String> = Vec::new();
-                words.extend(parts.broker.then(|| "broker".into()));
-                words.extend(parts.http.then(|| "http".into()));
-                words.extend(parts.rules.map(|_| "rules".into()));
-                for (name, fate) in &parts.buses {
-                    match fate {
-                        Fate::Restarts => words.push(format!("{name} restarts")),
-                        Fate::Begins => words.push(format!("{name} begins")),
-                        Fate::Stays { leave, come } => {
-                            words.extend(leave.iter().map(|device| format!("{device} leaves {name}")));
-                            words
-                                .extend(come.iter().map(|device| format!("{} comes to {name}", device.name)));
-                        }
-                    }
+        let change = compare(&settings(BEFORE), &settings(&text));
+        let mut words: Vec<String> = Vec::new();
+        words.extend(change.broker.then(|| "broker".into()));
+        words.extend(change.http.then(|| "http".into()));
+        words.extend(change.memory.then(|| "memory".into()));
+        words.extend(change.rules.map(|_| "rules".into()));
+        words.extend(match change.telling {
+            Telling::AsBefore => None,
+            Telling::Otherwise => Some("told otherwise".to_string()),
+            Telling::Elsewhere => Some("told elsewhere".to_string()),
+        });
+        for (name, fate) in &change.buses {
+            match fate {
+                Fate::Restarts => words.push(format!("{name} restarts")),
+                Fate::Begins => words.push(format!("{name} begins")),
+                Fate::Stays { leave, come } => {
+                    words.extend(leave.iter().map(|device| format!("{device} leaves {name}")));
+                    words.extend(come.iter().map(|device| format!("{} comes to {name}", device.name)));
                 }
-                words.extend(parts.ended.iter().map(|name| format!("{name} ends")));
-                assert_eq!(parts.is_nothing(), words.is_empty());
-                words.join(", ")
             }
-        };
+        }
+        words.extend(change.ended.iter().map(|name| format!("{name} ends")));
+        assert_eq!(change.is_nothing(), words.is_empty());
+        let told = words.join(", ");
         assert_eq!(told, expected, "{changes:?}");
     }
 
@@ -200,12 +221,19 @@ devices:
         ] {
             check(&[("\nmqtt:", &format!("\n{rule}\nmqtt:"))], "rules");
         }
-        for more in
-            ["base_topic: house", "topics: '{base}/{bus}/{device}/{point}'", "retain: false", "json: true"]
-        {
-            check(&[("'mqtt://localhost'", &format!("'mqtt://localhost', {more}"))], "everything");
+        let mqtt = |more: &str, expected: &str| {
+            check(&[("'mqtt://localhost'", &format!("'mqtt://localhost', {more}"))], expected);
+        };
+        for more in ["topics: '{base}/{bus}/{device}/{point}'", "retain: false", "json: true", "qos: 0"] {
+            mqtt(more, "told otherwise");
         }
-        check(&[("\nmqtt:", "\nhome_assistant: {discovery: false}\nmqtt:")], "everything");
-        check(&[("\nmqtt:", "\nstate_dir: /tmp\nmqtt:")], "everything");
+        mqtt("base_topic: house", "broker, told elsewhere");
+        mqtt("base_topic: house, json: true", "broker, told elsewhere");
+        mqtt("keep_alive: 30s", "broker");
+        mqtt("username: me, json: true", "broker, told otherwise");
+        for section in ["discovery: false", "prefix: ha", "minimum_version: '2025.4'", "expire_after: 3h"] {
+            check(&[("\nmqtt:", &format!("\nhome_assistant: {{{section}}}\nmqtt:"))], "told otherwise");
+        }
+        check(&[("\nmqtt:", "\nstate_dir: /tmp\nmqtt:")], "memory");
     }
 }

@@ -302,6 +302,16 @@ impl Values {
         self.missing_changed |= (is_missing(&before) || is_missing(&value.reading)) && has_changed;
     }
 
+    /// Who was told is gone: each point is told next as if for the first time. That a bit has flipped is told to who
+    /// is there then.
+    pub fn forget_what_was_told(&mut self, device: &Device) {
+        for (value, point) in self.values.iter_mut().zip(&device.points) {
+            if point.event.is_none() {
+                value.told = None;
+            }
+        }
+    }
+
     /// Whether what is missing, or why, has changed since this was last called.
     pub fn take_missing_changed(&mut self) -> bool {
         std::mem::take(&mut self.missing_changed)

@@ -10,6 +10,7 @@ mod orphans;
 mod proxy;
 mod reload;
 mod requests;
+mod retelling;
 mod secure;
 #[path = "../support/mod.rs"]
 mod support;

@@ -13,14 +13,14 @@ use crate::support::{Broker, Gateway, Received, Watcher, find};
 use crate::{json, over_tcp, remembered, simulation};
 
 /// A server of Modbus TCP that answers every read with zeros and remembers when it was asked.
-struct Witness {
-    address: SocketAddr,
+pub(super) struct Witness {
+    pub(super) address: SocketAddr,
     asked: Arc<Mutex<Vec<Time>>>,
     connections: Arc<Mutex<u32>>,
 }
 
 impl Witness {
-    fn start() -> Witness {
+    pub(super) fn start() -> Witness {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let address = listener.local_addr().expect("its address");
         let witness = Witness { address, asked: Arc::default(), connections: Arc::default() };
@@ -36,22 +36,22 @@ impl Witness {
         witness
     }
 
-    fn count(&self) -> usize {
+    pub(super) fn count(&self) -> usize {
         self.asked.lock().expect("nobody panics with it").len()
     }
 
-    fn wait_for_more(&self, more: usize) {
+    pub(super) fn wait_for_more(&self, more: usize) {
         let wanted = self.count() + more;
         find(|| (self.count() >= wanted).then_some(())).expect("polls go on");
     }
 
     /// The longest time between two questions, from the question number `from` on.
-    fn longest_gap(&self, from: usize) -> Duration {
+    pub(super) fn longest_gap(&self, from: usize) -> Duration {
         let asked = self.asked.lock().expect("nobody panics with it");
         asked[from..].windows(2).map(|pair| pair[1] - pair[0]).max().expect("two questions")
     }
 
-    fn connections(&self) -> u32 {
+    pub(super) fn connections(&self) -> u32 {
         *self.connections.lock().expect("nobody panics with it")
     }
 }
@@ -71,14 +71,14 @@ fn serve(mut stream: TcpStream, asked: &Mutex<Vec<Time>>, clock: Clock) {
 }
 
 /// The unchanged bus and its only device.
-fn steady(witness: &Witness) -> (String, String) {
+pub(super) fn steady(witness: &Witness) -> (String, String) {
     (
         format!("steady: {{tcp: '{}'}}", witness.address),
         "pump: {bus: steady, unit: 1, points: {flow: {at: input 0, poll: fast}}, poll: {fast: 300ms}}".into(),
     )
 }
 
-fn text(broker: &Broker, buses: &[&str], devices: &[&str]) -> String {
+pub(super) fn text(broker: &Broker, buses: &[&str], devices: &[&str]) -> String {
     format!(
         "mqtt: {{url: 'mqtt://127.0.0.1:{}'}}\nbuses:\n  {}\ndevices:\n  {}\n",
         broker.port,
@@ -87,9 +87,10 @@ fn text(broker: &Broker, buses: &[&str], devices: &[&str]) -> String {
     )
 }
 
-const RELAYS: &str = "relays: {profile: metz-connect/mr-do4, bus: line, unit: 18, name: Relays}";
-const COUNTERS: &str = "counters: {profile: metz-connect/mr-si4, bus: line, unit: 20, name: Counters}";
-const DONE: &str = "what has changed is at work";
+pub(super) const RELAYS: &str = "relays: {profile: metz-connect/mr-do4, bus: line, unit: 18, name: Relays}";
+pub(super) const COUNTERS: &str =
+    "counters: {profile: metz-connect/mr-si4, bus: line, unit: 20, name: Counters}";
+pub(super) const DONE: &str = "what has changed is at work";
 
 #[track_caller]
 fn online(watcher: &Watcher, devices: &[&str]) {
@@ -97,7 +98,7 @@ fn online(watcher: &Watcher, devices: &[&str]) {
 }
 
 #[track_caller]
-fn online_at(watcher: &Watcher, base: &str, devices: &[&str]) {
+pub(super) fn online_at(watcher: &Watcher, base: &str, devices: &[&str]) {
     for device in devices {
         watcher.wait_for(&format!("{base}/{device}/availability"), "online");
     }
@@ -214,6 +215,46 @@ fn another_budget_for_eeprom_is_taken_while_every_bus_goes_on_and_every_count() 
 }
 
 #[test]
+fn what_is_remembered_goes_to_another_folder_while_every_bus_goes_on() {
+    let (broker, simulation, witness) = (Broker::start(), simulation(), Witness::start());
+    let port = over_tcp(&simulation);
+    let line = format!("line: {{tcp: '{}'}}", port.address());
+    let (steady, pump) = steady(&witness);
+    let watcher = Watcher::start(&broker, "watcher");
+    let text = text(&broker, &[&line, &steady], &[RELAYS, &pump]);
+    let gateway = Gateway::start_with(&text);
+    online(&watcher, &["relays", "pump"]);
+    let set = |number: u8| {
+        let point = format!("busker/relays/relay_{number}_default");
+        watcher.publish(&format!("{point}/set"), "ON");
+        let outcome = watcher.wait_until("an outcome", |got| got.topic == format!("{point}/outcome"));
+        assert_eq!(json(&outcome.payload)["outcome"], "done", "{}", outcome.payload);
+    };
+    set(1);
+    let from = witness.count();
+    let folder = tempfile::tempdir().expect("a folder");
+    let other = folder.path().display();
+    gateway.write_whole(&format!("http: {{listen: '127.0.0.1:0'}}\nstate_dir: {other}\n{text}"));
+    watcher.forget();
+    gateway.reload(DONE);
+    set(2);
+    let file = folder.path().join("devices/relays.json");
+    let written = || Some(json(&std::fs::read_to_string(&file).ok()?)["persistent_writes"] == 2);
+    find(|| written().filter(|is_so| *is_so)).expect("both writes are remembered there");
+    // Nothing but a lock is held of the old one, and that no more.
+    let is_old = |path: &std::path::PathBuf| path.starts_with(gateway.state());
+    assert!(!gateway.open_files().iter().any(is_old), "{:?}", gateway.open_files());
+    for point in ["relays/availability", "pump/availability", "pump/flow"] {
+        assert_eq!(watcher.payloads(&format!("busker/{point}")), [""; 0], "{point} is told anew");
+    }
+    witness.wait_for_more(2);
+    assert_eq!(witness.connections(), 1, "the bus kept its connection");
+    let longest = witness.longest_gap(from.saturating_sub(2));
+    assert!(longest < Duration::from_millis(600), "a poll was lost: {longest:?}");
+    assert!(gateway.terminate().success());
+}
+
+#[test]
 fn a_faulty_configuration_changes_nothing_and_is_shown_where_people_look() {
     let (broker, witness) = (Broker::start(), Witness::start());
     let (steady, pump) = steady(&witness);
@@ -258,7 +299,7 @@ fn a_faulty_configuration_changes_nothing_and_is_shown_where_people_look() {
 }
 
 #[test]
-fn everything_begins_anew_also_after_a_long_calm() {
+fn everything_is_told_below_another_base_topic_also_after_a_long_calm() {
     let (broker, simulation, witness) = (Broker::start(), simulation(), Witness::start());
     let port = over_tcp(&simulation);
     let (steady, pump) = steady(&witness);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use busker::engine::address::{Span, Table};
-use busker::engine::bus::{Action, Bus, Command, Event, Saved, Severity};
+use busker::engine::bus::{Action, Bus, Command, Event, Saved, Severity, Telling};
 use busker::engine::memory::{Memories, Memory, Record};
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError, RequestsOfOthers};
 use busker::engine::profile::Library;
@@ -173,6 +173,11 @@ impl Player {
             "rules" => {
                 let rules = devices::settings(&rest.replace(", ", "\n")).rules();
                 self.bus.handle(self.now, Event::Rules(rules));
+            }
+            // The same: `json`.
+            "telling" => {
+                let settings = devices::settings(&rest.replace(", ", "\n"));
+                self.bus.handle(self.now, Event::Telling(Telling::of(&settings)));
             }
             "answer" => self.answer(rest),
             "devices-answer" => self.answering = true,

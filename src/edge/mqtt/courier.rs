@@ -1,7 +1,10 @@
 //! What the broker has to tell the rest of the program, and who brings it there.
 
+use std::sync::Mutex;
+
 use rumqttc::Publish;
 
+use super::lock;
 use crate::engine::arrivals::{Arrival, Arrivals, Mail};
 use crate::engine::time::Duration;
 
@@ -31,24 +34,45 @@ pub enum News {
 
 /// Brings news where they belong; whoever hears of something hands it over.
 pub(super) struct Courier<Tell> {
-    arrivals: Arrivals,
+    listening: Mutex<Listening>,
     tell: Tell,
+}
+
+struct Listening {
+    arrivals: Arrivals,
+    /// What was listened to before on this connection: it may be on its way still.
+    before: Option<Arrivals>,
 }
 
 impl<Tell: Fn(News)> Courier<Tell> {
     /// `tell` must not wait.
     pub fn new(arrivals: Arrivals, tell: Tell) -> Courier<Tell> {
-        Courier { arrivals, tell }
+        Courier { listening: Mutex::new(Listening { arrivals, before: None }), tell }
     }
 
-    /// What to subscribe to.
-    pub fn filters(&self) -> &[String] {
-        self.arrivals.filters()
+    /// On a new connection, where nothing is on its way: says what to subscribe to.
+    pub fn begin_anew(&self) -> Vec<String> {
+        let mut listening = lock(&self.listening);
+        listening.before = None;
+        listening.arrivals.filters().to_vec()
+    }
+
+    /// Listens to this from now on, on the same connection; says what was subscribed to before.
+    pub fn listen_to(&self, arrivals: Arrivals) -> Vec<String> {
+        let mut listening = lock(&self.listening);
+        let before = std::mem::replace(&mut listening.arrivals, arrivals);
+        let filters = before.filters().to_vec();
+        listening.before = Some(before);
+        filters
     }
 
     /// Says what a message is to this gateway.
     pub fn sort<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
-        self.arrivals.sort(mail)
+        let listening = lock(&self.listening);
+        match (listening.arrivals.sort(mail), &listening.before) {
+            (Arrival::Nothing, Some(before)) => before.sort(mail),
+            (arrival, _) => arrival,
+        }
     }
 
     pub fn tell(&self, news: News) {

@@ -11,12 +11,21 @@ use super::mailbox::Mailbox;
 use super::poller::Seen;
 use super::warnings;
 use crate::edge::clock::Clock;
-use crate::engine::arrivals::{Arrival, Mail};
+use crate::engine::arrivals::{Arrival, Arrivals, Mail};
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::settings::Manner;
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::Topics;
+
+/// What the feeder is asked to do.
+pub(super) enum Order {
+    /// To hear this from now on, and nothing else; and to say when the broker has confirmed it.
+    ListenTo(Arrivals, oneshot::Sender<()>),
+    /// To send what waits, and `offline`, and to disconnect. What waits is in this one, if the usual one is another
+    /// connection's by now.
+    End(Option<Arc<Mailbox>>),
+}
 
 /// Feeds the library from the outbox, and tells it what comes in but for what is for a bus: that has been brought there.
 pub(super) struct Feeder<Tell> {
@@ -32,14 +41,21 @@ pub(super) struct Feeder<Tell> {
     pub contested: bool,
     /// What was last told of the connection.
     pub told_up: Option<bool>,
-    pub subscribed: bool,
+    /// What is still to be subscribed to.
+    pub wanted: Vec<String>,
+    /// What the broker was asked for last.
+    pub asked_for: Vec<String>,
+    /// Who wants to know when it has answered.
+    pub awaits_answer: Option<oneshot::Sender<()>>,
+    /// What is still to be let go of.
+    pub unwanted: Vec<String>,
     pub ending: bool,
     /// Whether it was told that others tell something else of this gateway's state.
     pub denied: bool,
 }
 
 impl<Tell: Fn(News)> Feeder<Tell> {
-    pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut goodbye: oneshot::Receiver<()>) {
+    pub async fn run(mut self, mut events: mpsc::Receiver<Seen>, mut orders: mpsc::Receiver<Order>) {
         loop {
             let until = self.wake_at().map_or(Duration::from_secs(3600), |time| self.clock.until(time));
             tokio::select! {
@@ -49,10 +65,14 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 },
                 () = self.mailbox.news.notified() => {}
                 () = tokio::time::sleep(until) => self.wake(),
-                _ = &mut goodbye, if !self.ending => {
-                    self.ending = true;
-                    self.mailbox.outbox().goodbye();
-                }
+                order = orders.recv(), if !self.ending => match order {
+                    Some(Order::ListenTo(arrivals, told)) => self.listen_to(arrivals, told),
+                    Some(Order::End(rest)) => {
+                        self.mailbox = rest.unwrap_or(self.mailbox);
+                        self.end();
+                    }
+                    None => self.end(),
+                },
             }
             if self.ending && !self.connected {
                 return;
@@ -64,6 +84,25 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         }
     }
 
+    fn end(&mut self) {
+        self.ending = true;
+        self.mailbox.outbox().goodbye();
+    }
+
+    /// On the same connection: what stays is not asked for again.
+    fn listen_to(&mut self, arrivals: Arrivals, told: oneshot::Sender<()>) {
+        let now = arrivals.filters().to_vec();
+        let before = self.courier.listen_to(arrivals);
+        self.wanted.retain(|filter| now.contains(filter));
+        self.unwanted.retain(|filter| !now.contains(filter));
+        let (stays, goes): (Vec<String>, Vec<String>) =
+            before.into_iter().partition(|filter| now.contains(filter));
+        self.wanted.extend(now.into_iter().filter(|filter| !stays.contains(filter)));
+        self.unwanted.extend(goes);
+        // Whoever waits waits no longer where nothing is asked, or nobody could answer.
+        self.awaits_answer = (self.connected && !self.wanted.is_empty()).then_some(told);
+    }
+
     fn handle(&mut self, seen: Seen) {
         match seen {
             Seen::Up => {
@@ -73,7 +112,8 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 state.reason = None;
                 state.connects += 1;
                 drop(state);
-                (self.connected, self.subscribed) = (true, false);
+                self.connected = true;
+                (self.wanted, self.unwanted) = (self.courier.begin_anew(), Vec::new());
                 self.mailbox.outbox().connected();
                 self.told_up = Some(true);
                 self.courier.tell(News::Up);
@@ -90,7 +130,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.contested = contested;
                 state.reason = Some(reason);
                 drop(state);
-                self.connected = false;
+                (self.connected, self.awaits_answer) = (false, None);
                 self.mailbox.outbox().disconnected();
                 self.judge_length(closed_on);
                 if self.told_up != Some(false) {
@@ -104,7 +144,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.receive(&mail(&publish, &payload, stale_for));
             }
             Seen::Packet { packet: Packet::SubAck(answer), .. } => {
-                let codes = answer.return_codes.iter().zip(self.courier.filters());
+                let codes = answer.return_codes.iter().zip(&self.asked_for);
                 let refused = codes.filter(|(code, _)| **code == SubscribeReasonCode::Failure);
                 let refused: Vec<&str> = refused.map(|(_, filter)| filter.as_str()).collect();
                 if !refused.is_empty() {
@@ -117,6 +157,11 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 let mut outbox = self.mailbox.outbox();
                 outbox.cannot_hear(&refused);
                 outbox.listens(self.clock.now());
+                drop(outbox);
+                if let Some(told) = self.awaits_answer.take() {
+                    // Perhaps nobody waits any more.
+                    let _ = told.send(());
+                }
             }
             Seen::Packet { .. } | Seen::Room => {}
         }
@@ -214,7 +259,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
 
     /// When the broker is asked next whether it is there.
     fn asks_at(&self) -> Option<Time> {
-        if self.connected && self.subscribed { lock(&self.connection).asks_at() } else { None }
+        if self.connected && self.wanted.is_empty() { lock(&self.connection).asks_at() } else { None }
     }
 
     /// Asks what a broker answers and nobody else hears of: to be told no more of what this gateway was never told
@@ -234,13 +279,13 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         if !self.connected {
             return false;
         }
-        if !self.subscribed {
-            let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
-            self.subscribed =
-                self.client.try_subscribe_many(self.courier.filters().iter().map(filter)).is_ok();
-        }
+        self.subscribe();
         self.ask();
         let mut outbox = self.mailbox.outbox();
+        if !outbox.is_connected() {
+            // It is for another connection, which follows this one.
+            return false;
+        }
         while let Some(message) = outbox.next_message(self.clock.now()) {
             let Manner { confirmed, retain } = outbox.manner(&message);
             let qos = if confirmed { QoS::AtLeastOnce } else { QoS::AtMostOnce };
@@ -250,7 +295,23 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 return false;
             }
         }
-        self.subscribed && outbox.is_empty()
+        self.wanted.is_empty() && outbox.is_empty()
+    }
+
+    fn subscribe(&mut self) {
+        if !self.wanted.is_empty() {
+            let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
+            if self.client.try_subscribe_many(self.wanted.iter().map(filter)).is_ok() {
+                self.asked_for = std::mem::take(&mut self.wanted);
+            }
+        }
+        // Where the library has no room, it is tried again when it has.
+        while let Some(filter) = self.unwanted.last() {
+            if self.client.try_unsubscribe(filter).is_err() {
+                return;
+            }
+            self.unwanted.pop();
+        }
     }
 
     /// Waits until the library has sent everything and the connection is closed.

@@ -33,6 +33,11 @@ impl Mailbox {
         result
     }
 
+    /// From now on messages are put into this one.
+    pub fn exchange(&self, outbox: Outbox) -> Outbox {
+        std::mem::replace(&mut *self.outbox(), outbox)
+    }
+
     /// Whether less is worth remembering than before: [`Outbox::settle`].
     pub fn settle(&self, now: Time) -> bool {
         self.outbox().settle(now)

@@ -16,7 +16,7 @@ use tokio::task::JoinHandle;
 
 use self::courier::Courier;
 pub use self::courier::News;
-use self::feeder::Feeder;
+use self::feeder::{Feeder, Order};
 use self::losses::Ends;
 pub use self::mailbox::Mailbox;
 use self::poller::Poller;
@@ -38,6 +38,9 @@ const IN_FLIGHT: usize = 50;
 /// A device with a thousand points is announced in 215 kB. Larger than anything sane, since a packet
 /// above the limit ends the connection.
 const PACKET_BYTES_MAX: usize = 16 * 1024 * 1024;
+
+/// Orders that may wait; whoever gives more waits for the feeder.
+const ORDERS_MAX: usize = 4;
 
 /// How long the last messages may take when the program ends.
 const GOODBYE: Duration = Duration::from_secs(3);
@@ -69,7 +72,7 @@ impl BrokerState {
 /// The running connection.
 pub struct Broker {
     state: BrokerState,
-    goodbye: Option<oneshot::Sender<()>>,
+    orders: mpsc::Sender<Order>,
     feeder: JoinHandle<()>,
 }
 
@@ -107,7 +110,7 @@ impl Broker {
             clock,
         };
         let poller = tokio::spawn(poller.run());
-        let (goodbye, goodbye_heard) = oneshot::channel();
+        let (orders, orders_heard) = mpsc::channel(ORDERS_MAX);
         let feeder = Feeder {
             client,
             clock,
@@ -119,29 +122,40 @@ impl Broker {
             connected: false,
             contested: false,
             told_up: None,
-            subscribed: false,
+            wanted: Vec::new(),
+            asked_for: Vec::new(),
+            awaits_answer: None,
+            unwanted: Vec::new(),
             ending: false,
             denied: false,
         };
         let feeder = tokio::spawn(async move {
-            feeder.run(events, goodbye_heard).await;
+            feeder.run(events, orders_heard).await;
             poller.abort();
         });
         let state = BrokerState { state, connection, mailbox, clock };
-        Broker { state, goodbye: Some(goodbye), feeder }
+        Broker { state, orders, feeder }
     }
 
     pub fn state(&self) -> BrokerState {
         self.state.clone()
     }
 
+    /// Other topics are listened to from now on, on the same connection. Waits until the broker has confirmed it.
+    pub async fn listen_to(&self, settings: &Settings) {
+        let former_states = self.state.mailbox.look(Outbox::former_states);
+        let (told, confirmed) = oneshot::channel();
+        // The other side is gone only with the program.
+        let _ = self.orders.send(Order::ListenTo(Arrivals::new(settings, former_states), told)).await;
+        // A broker that is away is asked when it is there again.
+        let _ = tokio::time::timeout(GOODBYE, confirmed).await;
+    }
+
     /// Sends what waits, then `offline`, and disconnects, so that no last will follows. Gives up after
-    /// some seconds: then the last will says the same.
-    pub async fn finish(mut self) {
-        if let Some(goodbye) = self.goodbye.take() {
-            // The other side is gone only if the feeder has ended already.
-            let _ = goodbye.send(());
-        }
+    /// some seconds: then the last will says the same. What waits is in `rest`, if there is one.
+    pub async fn finish(mut self, rest: Option<Arc<Mailbox>>) {
+        // The other side is gone only if the feeder has ended already.
+        let _ = self.orders.send(Order::End(rest)).await;
         if tokio::time::timeout(GOODBYE, &mut self.feeder).await.is_err() {
             tracing::warn!("the broker did not take the last messages in time");
             self.feeder.abort();

@@ -8,7 +8,7 @@ use crate::engine::settings::{DeviceSettings, Rules};
 
 use super::device::DeviceState;
 use super::recording::Recorder;
-use super::{Action, Bus, InFlight, LinkState, Purpose};
+use super::{Action, Bus, InFlight, LinkState, Purpose, Telling};
 
 /// What commands and requests of a device are told that leaves.
 pub(super) const CHANGED: &str = "the configuration of the device has changed";
@@ -98,6 +98,20 @@ impl Bus {
             self.devices[index].change_rules(self.now, &rules, &mut self.context);
             self.tell_what_waits(index);
         }
+    }
+
+    /// What is known is told as if for the first time, and nothing is read for it.
+    pub(super) fn change_telling(&mut self, telling: Telling) {
+        let is_announced_there = self.context.telling.announces_where(&telling);
+        self.context.telling = telling;
+        for device in &mut self.devices {
+            device.tell_anew(self.now, is_announced_there, &mut self.context);
+        }
+    }
+
+    /// Whether everything is told there and so.
+    pub fn tells_as(&self, telling: &Telling) -> bool {
+        self.context.telling == *telling
     }
 
     /// These devices come, as at the start of the bus.

@@ -8,13 +8,38 @@ use crate::engine::settings::Settings;
 use crate::engine::time::{Date, Duration, Time};
 use crate::engine::topics::{DeviceTopics, Message};
 
-/// Where messages go, how they are told, and the actions that wait to be taken.
-pub(super) struct Context {
-    pub(super) actions: VecDeque<Action>,
+/// Where and in which way a gateway tells what it knows; it may change while its buses go on.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Telling {
     pub(super) gateway: Gateway,
     pub(super) discovery: bool,
     /// Whether each device tells all its values in one message too.
     pub(super) json: bool,
+}
+
+impl Telling {
+    pub fn of(settings: &Settings) -> Telling {
+        Telling {
+            gateway: Gateway::new(&settings.mqtt, &settings.home_assistant),
+            discovery: settings.home_assistant.discovery,
+            json: settings.mqtt.json,
+        }
+    }
+
+    /// Whether what one announces stands where the other one does.
+    pub(super) fn announces_where(&self, other: &Telling) -> bool {
+        let place = |telling: &'_ Telling| {
+            let Telling { gateway, discovery, .. } = telling;
+            (*discovery, gateway.prefix.clone(), gateway.topics.base().to_string())
+        };
+        place(self) == place(other)
+    }
+}
+
+/// Where messages go, how they are told, and the actions that wait to be taken.
+pub(super) struct Context {
+    pub(super) actions: VecDeque<Action>,
+    pub(super) telling: Telling,
     pub(super) bus_name: String,
     pub(super) republish: Duration,
     /// Some device has something new to be stored.
@@ -27,9 +52,7 @@ impl Context {
     pub(super) fn new(settings: &Settings, bus_name: &str) -> Context {
         Context {
             actions: VecDeque::from([Action::Reopen { after: Duration::ZERO }]),
-            gateway: Gateway::new(&settings.mqtt, &settings.home_assistant),
-            discovery: settings.home_assistant.discovery,
-            json: settings.mqtt.json,
+            telling: Telling::of(settings),
             bus_name: bus_name.to_string(),
             republish: settings.republish,
             has_to_remember: false,
@@ -42,7 +65,7 @@ impl Context {
     }
 
     pub(super) fn topics_of(&self, device: &str) -> DeviceTopics {
-        self.gateway.topics.of_device(&self.bus_name, device)
+        self.telling.gateway.topics.of_device(&self.bus_name, device)
     }
 
     /// The date at a time.

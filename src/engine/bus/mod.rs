@@ -40,6 +40,7 @@ use crate::engine::topics::Message;
 pub use commands::STOPPING;
 use commands::{Active, Settling};
 use context::Context;
+pub use context::Telling;
 use device::{DeviceState, Turn};
 use devices::Devices;
 use fetch::Fetch;
@@ -73,6 +74,8 @@ pub enum Event {
     Adopt(Vec<DeviceSettings>, Memories),
     /// What holds for every bus is from now on this.
     Rules(Rules),
+    /// Everything is told there and so from now on, and what is known at once: [`Bus::tells_as`].
+    Telling(Telling),
     /// The request of the last [`Action::Send`] was taken back before it was on the wire.
     Withdrawn,
     /// The recording of an [`Action::Record`] is in a file, or why not.
@@ -317,6 +320,7 @@ impl Bus {
             Event::Retire(device) => self.retire(&device),
             Event::Adopt(devices, memories) => self.adopt(devices, &memories),
             Event::Rules(rules) => self.change_rules(rules),
+            Event::Telling(telling) => self.change_telling(telling),
             Event::Recorded(request, result) => self.recorded(request, result),
             Event::BrokerUp => {
                 self.broker_up = true;
@@ -335,7 +339,7 @@ impl Bus {
             self.ask_next();
         }
         self.end_refreshes();
-        if self.context.json {
+        if self.context.telling.json {
             self.devices.iter_mut().for_each(|device| device.tell_whole(now, &mut self.context));
         }
         self.remember();
@@ -360,7 +364,7 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let tell_wholes: &[DeviceState] = if self.context.json { &self.devices } else { &[] };
+        let tell_wholes: &[DeviceState] = if self.context.telling.json { &self.devices } else { &[] };
         let wholes = tell_wholes.iter().filter_map(DeviceState::whole_due_at);
         let records = self.record_due_at.into_iter().chain(self.recorder.due_at()).chain(wholes);
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {

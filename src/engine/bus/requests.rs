@@ -177,12 +177,12 @@ impl Bus {
     }
 
     pub(super) fn refuse(&mut self, request: &Request, reason: &str) {
-        let message = request.refusal(&self.context.gateway.topics, reason);
+        let message = request.refusal(&self.context.telling.gateway.topics, reason);
         self.context.publish(message);
     }
 
     pub(super) fn tell(&mut self, request: &Request, status: Status, data: Json, error: Option<&str>) {
-        let message = request.answer(&self.context.gateway.topics, status, data, error);
+        let message = request.answer(&self.context.telling.gateway.topics, status, data, error);
         self.context.publish(message);
     }
 

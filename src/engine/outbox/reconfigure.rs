@@ -3,12 +3,47 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use crate::engine::homeassistant::Announcement;
-use crate::engine::topics::{self, Message};
+use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::settings::Settings;
+use crate::engine::topics::{self, Kind, Message, Topics};
 
 use super::{Outbox, Queued, Rank, Tree};
 
 impl Outbox {
+    /// The gateway will be as these settings want it, below the base topic that it had: its devices tell something on
+    /// `wanted`. What stood elsewhere is taken back by [`Outbox::reconfigure`], when it has been told anew.
+    pub fn tell_otherwise(&mut self, settings: &Settings, wanted: &BTreeSet<String>) {
+        let home_assistant = &settings.home_assistant;
+        let prefix = format!("{}/device/", home_assistant.prefix);
+        if prefix != self.discovery_prefix {
+            for topic in self.in_order(|rank| rank == Rank::Discovery) {
+                self.take_back_announcement(&topic);
+            }
+        }
+        let values = settings.mqtt.values;
+        let is_kept_otherwise = values.retain != self.values.retain;
+        (self.topics, self.discovery_prefix, self.values) = (Topics::of(&settings.mqtt), prefix, values);
+        if is_kept_otherwise {
+            self.keep_otherwise();
+        }
+        // Nothing of it that an earlier run has left is taken back before it is told.
+        self.own_devices
+            .extend(discovery_topics(&home_assistant.prefix, homeassistant::identities(settings)));
+        self.wanted.extend(wanted.iter().cloned());
+    }
+
+    /// The broker is to keep values that it does not, or the other way round.
+    fn keep_otherwise(&mut self) {
+        for topic in self.in_order(|rank| rank == Rank::State) {
+            let is_value = self.topics.kind(&topic) == Kind::Value;
+            let Some(entry) = self.retained.get_mut(&topic).filter(|_| is_value) else { continue };
+            entry.kept = !self.values.retain;
+            if !std::mem::replace(&mut entry.queued, true) {
+                self.queue_last(Queued::Newest(topic));
+            }
+        }
+    }
+
     /// The gateway has something else now: `identities` as for [`Outbox::new`], and on `wanted` its devices
     /// tell something, on `before` they did. What it has told of anything else, perhaps only in an earlier run,
     /// is taken back at the broker.
@@ -21,9 +56,8 @@ impl Outbox {
         let told_earlier = before.difference(wanted).filter(|topic| !self.retained.contains_key(&***topic));
         self.left_behind.extend(told_earlier.cloned());
         self.wanted.clone_from(wanted);
-        let prefix = self.discovery_prefix.trim_end_matches("/device/").to_string();
-        let own = identities.into_iter().map(|identity| topics::discovery(&prefix, &identity));
-        self.own_devices = own.collect();
+        let prefix = self.discovery_prefix.trim_end_matches("/device/");
+        self.own_devices = discovery_topics(prefix, identities).collect();
         let of_devices = self.in_order(|rank| !matches!(rank, Rank::Bridge | Rank::BridgeState));
         for topic in of_devices {
             if self.rank(&topic) == Rank::Discovery {
@@ -66,8 +100,9 @@ impl Outbox {
         stood
     }
 
-    /// What the gateway's next outbox has to [`Outbox::recall`] when this one has ended: `announced` is what
-    /// [`Outbox::take_back_everything`] returned, `told_on` is where the devices told something.
+    /// What the gateway's next outbox, below another base topic, has to [`Outbox::recall`] when this one has ended:
+    /// `announced` is what [`Outbox::take_back_everything`] returned, `told_on` is where the devices told something.
+    /// That this gateway is offline stands there still.
     pub fn legacy(
         &self,
         announced: BTreeMap<String, String>,
@@ -75,7 +110,8 @@ impl Outbox {
     ) -> (BTreeMap<String, String>, Vec<Tree>) {
         if self.is_empty() {
             // Everything has been taken back.
-            (BTreeMap::new(), self.former_trees().collect())
+            let present = Tree { base_topic: self.topics.base().into(), topics: BTreeSet::new() };
+            (BTreeMap::new(), std::iter::once(present).chain(self.former_trees()).collect())
         } else {
             (announced, self.trees(told_on))
         }
@@ -124,10 +160,19 @@ impl Outbox {
     }
 }
 
+fn discovery_topics(
+    prefix: &str,
+    identities: impl IntoIterator<Item = String>,
+) -> impl Iterator<Item = String> {
+    identities.into_iter().map(move |identity| topics::discovery(prefix, &identity))
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::taken_back::ARRIVES_WITHIN;
     use super::*;
+    use crate::engine::configuration;
+    use crate::engine::profile::Library;
     use crate::engine::time::Time;
     use crate::engine::topics::Topics;
 
@@ -160,6 +205,59 @@ mod tests {
     fn without_the_pump(outbox: &mut Outbox) {
         let wanted = ["busker/boiler/availability", "busker/boiler/flow"].map(String::from).into();
         outbox.reconfigure(["busker_bridge", "busker_boiler"].map(String::from), &BTreeSet::new(), &wanted);
+    }
+
+    /// The same gateway, with `more` in its configuration; its devices are `boiler` and `pump`.
+    fn settings(more: &str) -> Settings {
+        let text = format!(
+            "{more}\nbuses: {{a: {{tcp: 'h:1'}}}}\ndevices:\n  boiler: {{bus: a, unit: 1, points: {{flow: {{at: input 0, poll: fast}}}}}}\n  \
+             pump: {{bus: a, unit: 2, points: {{speed: {{at: input 0, poll: fast}}}}}}\n"
+        );
+        let loaded = configuration::load("busker.yaml", text.as_bytes(), &Library::shipped());
+        loaded.unwrap_or_else(|faults| panic!("{faults:?}")).0
+    }
+
+    #[test]
+    fn what_stands_elsewhere_is_taken_back_when_it_has_been_told_anew() {
+        let new = settings(
+            "mqtt: {url: 'mqtt://h', topics: '{base}/x/{device}/{point}'}\nhome_assistant: {prefix: ha}",
+        );
+        let wanted = ["availability", "flow"].map(|point| format!("busker/x/boiler/{point}")).into();
+        let mut outbox = outbox();
+        outbox.tell_otherwise(&new, &wanted);
+        // Found of an earlier life there: it will be announced.
+        let earlier = "{\"origin\":{\"name\":\"busker\"},\"availability\":[{\"topic\":\"busker/bridge/state\"}],\
+             \"components\":{}}";
+        outbox.found("ha/device/busker_pump/config", earlier);
+        let told = [
+            ("ha/device/busker_boiler/config", "{}"),
+            ("busker/x/boiler/availability", "online"),
+            ("busker/x/boiler/flow", "21.5"),
+        ];
+        told.iter().for_each(|(topic, payload)| outbox.push(Message::retained(*topic, *payload)));
+        let announced =
+            ["bridge", "boiler", "pump"].map(|of| format!("homeassistant/device/busker_{of}/config "));
+        let told = told.map(|(topic, payload)| format!("{topic} {payload}"));
+        let all = sent(&mut outbox);
+        assert_eq!(all.len(), 6, "{all:?}");
+        assert!(announced.iter().chain(&told).all(|message| all.contains(message)), "{all:?}");
+        outbox.reconfigure(homeassistant::identities(&new), &BTreeSet::new(), &wanted);
+        let gone = ["boiler/availability", "boiler/flow", "boiler/old", "pump/availability"];
+        assert_eq!(sent(&mut outbox), gone.map(|topic| format!("busker/{topic} ")));
+    }
+
+    #[test]
+    fn values_that_the_broker_shall_keep_or_not_are_told_so_at_once() {
+        let mut outbox = outbox();
+        let without = settings("mqtt: {url: 'mqtt://h', retain: false}");
+        let values = ["flow", "old"].map(|point| format!("busker/boiler/{point} "));
+        outbox.tell_otherwise(&without, &BTreeSet::new());
+        let told = sent(&mut outbox);
+        assert!(values.iter().all(|removal| told.contains(removal)) && told.len() == 4, "{told:?}");
+        outbox.tell_otherwise(&settings("mqtt: {url: 'mqtt://h'}"), &BTreeSet::new());
+        let message = outbox.next_message(Time(0)).expect("a value");
+        assert!(outbox.manner(&message).retain, "{message:?}");
+        assert_eq!((message.payload.as_str(), sent(&mut outbox).len()), ("21.5", 1));
     }
 
     const TAKEN_BACK: [&str; 3] =
@@ -201,7 +299,8 @@ mod tests {
         assert_eq!(of_boiler, announced);
         assert_eq!(trees, [Tree { base_topic: "busker".into(), topics: told_on.clone() }]);
         sent(&mut outbox);
-        assert_eq!(outbox.legacy(announced, told_on), (BTreeMap::new(), Vec::new()));
+        let nothing_but_its_state = Tree { base_topic: "busker".into(), topics: BTreeSet::new() };
+        assert_eq!(outbox.legacy(announced, told_on), (BTreeMap::new(), vec![nothing_but_its_state]));
     }
 
     #[test]

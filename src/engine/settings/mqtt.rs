@@ -48,6 +48,14 @@ impl Default for Mqtt {
     }
 }
 
+impl Mqtt {
+    /// Whether the same connection serves both, whatever is told on it and in which way.
+    pub fn is_reached_as(&self, other: &Mqtt) -> bool {
+        let Mqtt { topics, values, json, .. } = other.clone();
+        Mqtt { topics, values, json, ..self.clone() } == *other
+    }
+}
+
 impl fmt::Debug for Mqtt {
     /// Tells everything but the password.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -214,6 +214,33 @@ impl DeviceState {
         context.publish(Message::retained(topic, if available { ONLINE } else { OFFLINE }));
     }
 
+    /// What was told counts no more, since all is told elsewhere or otherwise from now on: what is known is told again.
+    /// `is_announced_there`: what was announced stands where it is announced now.
+    pub(in crate::engine::bus) fn tell_anew(
+        &mut self,
+        now: Time,
+        is_announced_there: bool,
+        context: &mut Context,
+    ) {
+        let available = self.told.available.take() == Some(true);
+        self.told.info.clear();
+        self.told.things.fill(None);
+        self.told.whole = Whole::default();
+        self.values.forget_what_was_told(&self.settings.device);
+        if !is_announced_there {
+            self.told.announced = None;
+        }
+        self.told.announcement_due = true;
+        // Of a device that is away it may not be known what it is, and less than all would take entities away.
+        if available || homeassistant::is_settled(&self.settings.device, self.values.known()) {
+            self.announce(context);
+        }
+        self.tell_all(now, context);
+        self.tell_whole_at_once(now, context);
+        self.publish_availability(available, context);
+        self.tell_info(now, context);
+    }
+
     /// The last word before the end.
     pub(in crate::engine::bus) fn say_offline(&mut self, context: &mut Context) {
         self.publish_availability(false, context);
@@ -221,7 +248,7 @@ impl DeviceState {
 
     pub(super) fn announce(&mut self, context: &mut Context) {
         self.told.announcement_due = false;
-        if !context.discovery {
+        if !context.telling.discovery {
             return;
         }
         let next = self.announcement(context);
@@ -242,7 +269,12 @@ impl DeviceState {
 
     /// What Home Assistant is to know of the device now.
     pub(super) fn announcement(&self, context: &Context) -> Announcement {
-        homeassistant::announcement(&context.gateway, &self.settings, &context.bus_name, self.values.known())
+        homeassistant::announcement(
+            &context.telling.gateway,
+            &self.settings,
+            &context.bus_name,
+            self.values.known(),
+        )
     }
 
     /// Whether the info is as old as anything is told again.

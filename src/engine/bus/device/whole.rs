@@ -46,7 +46,7 @@ impl DeviceState {
 
     /// Tells the message, if there is one, although the last may have been told just now.
     pub(super) fn tell_whole_at_once(&mut self, now: Time, context: &mut Context) {
-        if context.json && self.told.whole.changed {
+        if context.telling.json && self.told.whole.changed {
             self.publish_whole(now, context);
         }
     }
