@@ -42,8 +42,8 @@ lint:
 goldens:
 	@$(WITH_MOSQUITTO) && BLESS=1 exec cargo test --locked
 
-# The release build against a paced wire, about eight minutes on an otherwise idle machine; writes
-# docs/performance.md. `make bench ROWS=W1,W8` runs only these, `make bench QUICK=1` takes about a minute.
+# The release build against a paced wire, about six minutes on an otherwise idle machine; writes
+# docs/performance.md. `make bench ROWS=W1,W8` runs only these, `make bench QUICK=1` takes one or two minutes.
 bench:
 	@$(WITH_MOSQUITTO) && cargo build --locked --release --bin busker --example bench && \
 		BUSKER_LIBMODBUS_LOOP="$$(scripts/get-libmodbus-loop)" \

@@ -1,6 +1,7 @@
 //! What is known of the connection to the broker: when to try again after a loss, whether somebody else
 //! takes our place again and again, and how old a message may be that has just arrived.
 
+use crate::engine::outbox::may_be_too_long;
 use crate::engine::time::{Duration, Time};
 
 /// Pauses between attempts begin here and double.
@@ -8,7 +9,7 @@ const PAUSE_FIRST: Duration = Duration::from_millis(500);
 const PAUSE_LAST: Duration = Duration::from_secs(30);
 
 /// A broker that closes the connection over a long message has done so at once, and lets us in again at once.
-const ATTEMPTS_CHOKED: u32 = 1;
+const ATTEMPTS_TOO_LONG: u32 = 1;
 
 /// A connection that held this long was a good one: after it the pauses begin anew.
 const GOOD_AFTER: Duration = Duration::from_secs(10);
@@ -42,12 +43,19 @@ const LISTEN_AFTER_SILENCE: Duration = Duration::from_secs(1);
 pub enum Loss {
     /// The broker closed it.
     Closed,
-    /// The same while a long message was on its way to it, which it may not take.
-    Choked,
     /// Nothing came within a time limit.
     Silent,
     /// Anything else: refused, unreachable, not understood.
     Failed,
+}
+
+/// What follows from a loss.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AfterLoss {
+    /// How long to wait before the next attempt.
+    pub pause: Duration,
+    /// The topic and the bytes of a message that the broker may have closed the connection for.
+    pub suspect: Option<(String, usize)>,
 }
 
 /// The connection to one broker. Told what happens in the order in which it happens.
@@ -116,18 +124,21 @@ impl Connection {
         Some(now - since)
     }
 
-    /// It is lost, or could not be made. Tells how long to wait before the next attempt; `seed` is any
-    /// number that varies, so that many gateways do not come back to a restarted broker in the same
-    /// moment.
-    pub fn lost(&mut self, now: Time, loss: Loss, seed: u64) -> Duration {
+    /// It is lost, or could not be made. `longest`: topic and bytes of the longest message that was on its way
+    /// and is not confirmed. `seed` is any number that varies, so that many gateways do not come back to a
+    /// restarted broker in the same moment.
+    pub fn lost(&mut self, now: Time, loss: Loss, longest: Option<(String, usize)>, seed: u64) -> AfterLoss {
         let held = self.since.take().map(|since| now - since);
-        match (held, loss) {
-            (Some(held), Loss::Closed) if self.thrown_out > 0 && held < THROWN_OUT_WITHIN => {
-                self.thrown_out = if self.attempts_since_loss == 1 { self.thrown_out + 1 } else { 1 };
+        let is_closed = held.is_some() && loss == Loss::Closed;
+        let suspect = longest.filter(|(_, bytes)| is_closed && may_be_too_long(*bytes));
+        match held {
+            Some(held) if is_closed && suspect.is_none() => {
+                let is_thrown_out_again = self.thrown_out > 0 && held < THROWN_OUT_WITHIN;
+                let at_once = self.attempts_since_loss == 1;
+                self.thrown_out = if is_thrown_out_again && at_once { self.thrown_out + 1 } else { 1 };
             }
-            (Some(_), Loss::Closed) => self.thrown_out = 1,
-            (Some(_), Loss::Choked | Loss::Silent | Loss::Failed) => self.thrown_out = 0,
-            (None, _) => self.attempts_since_loss += 1,
+            Some(_) => self.thrown_out = 0,
+            None => self.attempts_since_loss += 1,
         }
         if held.is_some() {
             self.attempts_since_loss = 0;
@@ -140,11 +151,11 @@ impl Connection {
         (self.asked_at, self.stale) = (None, None);
         let pause = pause(self.attempts, self.contested, seed);
         self.attempts += 1;
-        if loss == Loss::Choked {
+        if suspect.is_some() {
             // Which message that is, is found out in a few attempts.
-            self.attempts = self.attempts.min(ATTEMPTS_CHOKED);
+            self.attempts = self.attempts.min(ATTEMPTS_TOO_LONG);
         }
-        pause
+        AfterLoss { pause, suspect }
     }
 
     /// Whether the broker has accepted us and not gone since.
@@ -180,6 +191,11 @@ mod tests {
         Time::from_millis(seconds * 1000)
     }
 
+    /// With nothing on its way.
+    fn lose(connection: &mut Connection, now: Time, loss: Loss) -> Duration {
+        connection.lost(now, loss, None, 0).pause
+    }
+
     #[test]
     fn the_pause_between_attempts_grows_to_a_bound_and_varies() {
         for (attempts, contested, longest) in [
@@ -203,11 +219,31 @@ mod tests {
     fn after_a_good_connection_the_pauses_begin_anew_and_after_a_short_one_they_grow() {
         for (held, expected) in [(9, 2000), (10, 500)] {
             let mut connection = Connection::default();
-            connection.lost(at(0), Loss::Failed, 0);
-            connection.lost(at(1), Loss::Failed, 0);
+            lose(&mut connection, at(0), Loss::Failed);
+            lose(&mut connection, at(1), Loss::Failed);
             connection.made(at(2));
-            let pause = connection.lost(at(2 + held), Loss::Failed, 0);
+            let pause = lose(&mut connection, at(2 + held), Loss::Failed);
             assert_eq!(pause, Duration::from_millis(expected), "held {held} s");
+        }
+    }
+
+    #[test]
+    fn a_long_message_is_suspected_where_the_broker_closed_what_it_had_accepted() {
+        for (made, loss, bytes, is_suspect) in [
+            (true, Loss::Closed, Some(9000), true),
+            (true, Loss::Closed, Some(20), false),
+            (true, Loss::Closed, None, false),
+            (true, Loss::Silent, Some(9000), false),
+            (true, Loss::Failed, Some(9000), false),
+            (false, Loss::Closed, Some(9000), false),
+        ] {
+            let mut connection = Connection::default();
+            if made {
+                connection.made(at(0));
+            }
+            let longest = bytes.map(|bytes| ("busker/boiler/info".to_string(), bytes));
+            let suspect = connection.lost(at(1), loss, longest.clone(), 0).suspect;
+            assert_eq!(suspect, longest.filter(|_| is_suspect), "made: {made}, {loss:?}, {bytes:?} bytes");
         }
     }
 
@@ -216,7 +252,8 @@ mod tests {
         let (mut connection, mut pauses) = (Connection::default(), Vec::new());
         for second in 0..8 {
             connection.made(at(second * 2));
-            pauses.push(connection.lost(at(second * 2), Loss::Choked, 0).as_millis());
+            let long = Some(("busker/boiler/info".to_string(), 9000));
+            pauses.push(connection.lost(at(second * 2), Loss::Closed, long, 0).pause.as_millis());
         }
         assert_eq!(pauses, [500, 1000, 1000, 1000, 1000, 1000, 1000, 1000]);
         assert!(!connection.is_contested(at(20)));
@@ -228,11 +265,11 @@ mod tests {
         let (mut connection, mut now) = (Connection::default(), 0);
         for (held, loss, at_once) in losses {
             if !at_once {
-                connection.lost(at(now), Loss::Failed, 0);
+                lose(&mut connection, at(now), Loss::Failed);
             }
             connection.made(at(now));
             now += held;
-            connection.lost(at(now), *loss, 0);
+            lose(&mut connection, at(now), *loss);
             now += 1;
         }
         assert_eq!(connection.is_contested(at(now)), expected, "{losses:?}");
@@ -257,7 +294,7 @@ mod tests {
         let (mut now, mut pauses) = (0, Vec::new());
         for _ in 0..10 {
             connection.made(at(now));
-            pauses.push(connection.lost(at(now + 20), Loss::Closed, 0).as_secs());
+            pauses.push(lose(&mut connection, at(now + 20), Loss::Closed).as_secs());
             now += 30;
         }
         // The first few may have been anything.
@@ -265,7 +302,7 @@ mod tests {
         connection.made(at(now));
         assert!(connection.is_contested(at(now + 299)));
         assert!(!connection.is_contested(at(now + 300)));
-        assert_eq!(connection.lost(at(now + 300), Loss::Closed, 0), PAUSE_FIRST);
+        assert_eq!(lose(&mut connection, at(now + 300), Loss::Closed), PAUSE_FIRST);
         assert!(!connection.is_contested(at(now + 301)));
     }
 
@@ -298,7 +335,7 @@ mod tests {
         connection.heard(at(13));
         connection.heard(at(18));
         assert_eq!((connection.asks_at(), connection.stale_for(at(18))), (Some(at(18)), None));
-        connection.lost(at(19), Loss::Closed, 0);
+        lose(&mut connection, at(19), Loss::Closed);
         assert_eq!(connection.asks_at(), None);
         assert!(ASK_EVERY + STALLED_AFTER < Duration::from_secs(10));
     }
@@ -338,7 +375,7 @@ mod tests {
             let mut connection = Connection::default();
             connection.made(at(0));
             for loss in losses {
-                connection.lost(at(30), *loss, 0);
+                lose(&mut connection, at(30), *loss);
             }
             assert_eq!(connection.made(at(60)), expected, "{losses:?}");
             assert_eq!(connection.made(at(61)), Duration::ZERO, "once");

@@ -202,9 +202,10 @@ fn pump(shared: &Shared, mut from: &TcpStream, mut to: &TcpStream, to_broker: bo
             let waited = shared.1.wait_while(state, is_held);
             waited.unwrap_or_else(PoisonError::into_inner).way
         };
-        let length = match from.read(&mut bytes) {
+        // Only looked at, since it may be held while we wait here: then it stays where `wait_until_held` looks.
+        match from.peek(&mut bytes) {
             Ok(0) => return,
-            Ok(length) => length,
+            Ok(_) => {}
             Err(error)
                 if matches!(error.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) =>
             {
@@ -215,14 +216,14 @@ fn pump(shared: &Shared, mut from: &TcpStream, mut to: &TcpStream, to_broker: bo
                 continue;
             }
             Err(_) => return,
-        };
-        // It may have been held while we waited in `read`.
+        }
         let limit = {
             let state = lock(shared);
             let state = shared.1.wait_while(state, is_held);
             let state = state.unwrap_or_else(PoisonError::into_inner);
             if to_broker { state.cut_to_broker } else { state.cut_from_broker }
         };
+        let Ok(length) = from.read(&mut bytes) else { return };
         let allowed = limit.map_or(length, |limit| limit.saturating_sub(passed).min(length));
         if to.write_all(&bytes[..allowed]).is_err() || limit.is_some_and(|limit| passed + allowed >= limit) {
             return;

@@ -53,12 +53,17 @@ fn every_command_of_the_readme_is_run_by_a_test() {
 fn the_links_of_the_documents_lead_somewhere() {
     let documents =
         ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "deploy/README.md", "device-profiles/README.md"];
-    for document in documents {
-        let text = read(document);
+    let in_docs = ["docs", "docs/decisions"].map(|folder| {
+        let files = std::fs::read_dir(root().join(folder)).expect("the folder is there");
+        files.map(move |file| format!("{folder}/{}", file.expect("a file").file_name().to_string_lossy()))
+    });
+    let in_docs = in_docs.into_iter().flatten().filter(|name| name.ends_with(".md"));
+    for document in documents.map(String::from).into_iter().chain(in_docs) {
+        let text = read(&document);
         for link in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
             let target = link.split('#').next().unwrap_or_default();
             if !target.is_empty() && !target.contains("://") {
-                let path = root().join(document).with_file_name(target);
+                let path = root().join(&document).with_file_name(target);
                 assert!(path.exists(), "{document} links to {target}, which is not there");
             }
         }

@@ -101,9 +101,10 @@ impl Broker {
     fn launch(&mut self) -> bool {
         let folder = self.folder.path();
         let file = folder.join("mosquitto.conf");
-        // Started by root it would become another user, who may not read what tests write.
+        // Started by root it would become another user, who may not read what tests write. And it would hold
+        // back by 40 ms what it sends while something before it is not acknowledged.
         let text = format!(
-            "listener {} {}\nuser root\nlog_dest stderr\npersistence_location {}/\n{}",
+            "listener {} {}\nset_tcp_nodelay true\nuser root\nlog_dest stderr\npersistence_location {}/\n{}",
             self.port,
             self.address,
             folder.display(),

@@ -1,11 +1,11 @@
-//! Somebody who watches every topic and remembers in which order what came.
+//! Somebody who watches topics, mostly all, and remembers in which order what came.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use busker::edge::clock::Clock;
 use busker::engine::time::Time;
-use rumqttc::{Client, Event, MqttOptions, Packet, QoS};
+use rumqttc::{Client, Event, MqttOptions, NetworkOptions, Packet, QoS};
 
 use super::{Broker, Collected, PATIENCE, collect, lock, wait_on};
 
@@ -19,7 +19,7 @@ pub struct Received {
     pub at: Time,
 }
 
-/// Watches every topic, through restarts of the broker.
+/// Watches topics, through restarts of the broker.
 pub struct Watcher {
     client: Client,
     received: Arc<Collected<Received>>,
@@ -32,20 +32,29 @@ impl Watcher {
     }
 
     pub fn start_as(broker: &Broker, name: &str, user: Option<(&str, &str)>) -> Watcher {
+        Watcher::start_of("#", broker, name, user)
+    }
+
+    /// Watches only these topics.
+    pub fn start_of(topics: &str, broker: &Broker, name: &str, user: Option<(&str, &str)>) -> Watcher {
         let mut options = MqttOptions::new(name, broker.address, broker.port);
         options.set_max_packet_size(1 << 24, 1 << 24);
         if let Some((user, password)) = user {
             options.set_credentials(user, password);
         }
         let (client, mut connection) = Client::new(options, 5000);
+        let mut network = NetworkOptions::new();
+        network.set_tcp_nodelay(true);
+        connection.eventloop.set_network_options(network);
         let received = Arc::<Collected<Received>>::default();
         let (subscribed, is_subscribed) = std::sync::mpsc::channel();
         let (own_client, own_received, clock) = (client.clone(), received.clone(), Clock::start());
+        let topics = topics.to_owned();
         std::thread::spawn(move || {
             for event in connection.iter() {
                 match event {
                     Ok(Event::Incoming(Packet::ConnAck(_))) => {
-                        own_client.try_subscribe("#", QoS::AtLeastOnce).expect("there is room");
+                        own_client.try_subscribe(&topics, QoS::AtLeastOnce).expect("there is room");
                     }
                     Ok(Event::Incoming(Packet::SubAck(_))) => {
                         // Nobody waits for the second time.

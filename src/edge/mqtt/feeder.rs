@@ -118,7 +118,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.told_up = Some(true);
                 self.courier.tell(News::Up);
             }
-            Seen::Down { reason, contested, closed_on } => {
+            Seen::Down { reason, contested, suspect } => {
                 let mut state = lock(&self.state);
                 state.connected = false;
                 // Once for each reason, not once for each attempt; and a quarrel once, not each time
@@ -132,7 +132,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 drop(state);
                 (self.connected, self.awaits_answer) = (false, None);
                 self.mailbox.outbox().disconnected();
-                self.judge_length(closed_on);
+                self.judge_length(suspect);
                 if self.told_up != Some(false) {
                     self.told_up = Some(false);
                     self.courier.tell(News::Down);
@@ -169,9 +169,9 @@ impl<Tell: Fn(News)> Feeder<Tell> {
 
     /// A broker that takes no message as long as the one which it was sent has no other word for that than to close
     /// the connection.
-    fn judge_length(&self, closed_on: Option<(String, usize)>) {
+    fn judge_length(&self, suspect: Option<(String, usize)>) {
         let mut outbox = self.mailbox.outbox();
-        let Some((topic, bytes)) = closed_on else { return outbox.lost() };
+        let Some((topic, bytes)) = suspect else { return outbox.lost() };
         if outbox.closed_on(&topic, bytes) {
             tracing::warn!(
                 "the broker closes the connection whenever it is sent what belongs on `{topic}`, {bytes} bytes: most \

@@ -10,7 +10,7 @@ mod warnings;
 
 use std::sync::{Arc, Mutex};
 
-use rumqttc::{AsyncClient, LastWill, MqttOptions, QoS};
+use rumqttc::{AsyncClient, LastWill, MqttOptions, NetworkOptions, QoS};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
@@ -89,7 +89,8 @@ impl Broker {
         let options = options(&settings.mqtt, &topics, secrets);
         let client_id = options.client_id();
         mailbox.change(Outbox::disconnected);
-        let (client, event_loop) = AsyncClient::new(options, IN_FLIGHT);
+        let (client, mut event_loop) = AsyncClient::new(options, IN_FLIGHT);
+        event_loop.set_network_options(network());
         let state = Arc::new(Mutex::new(BrokerReport::default()));
         let connection = Arc::new(Mutex::new(Connection::default()));
         let (events_out, events) = mpsc::channel(IN_FLIGHT);
@@ -186,4 +187,12 @@ fn options(mqtt: &Mqtt, topics: &Topics, secrets: Secrets) -> MqttOptions {
     options.set_last_will(LastWill::new(topics.bridge_state(), OFFLINE, QoS::AtLeastOnce, true));
     secrets.enter(&mut options, mqtt);
     options
+}
+
+/// What is told goes out at once. Otherwise the kernel holds it back while anything before it is not acknowledged:
+/// the outcome of a command for 40 ms behind the confirmation that the command has come.
+fn network() -> NetworkOptions {
+    let mut network = NetworkOptions::new();
+    network.set_tcp_nodelay(true);
+    network
 }

@@ -10,8 +10,7 @@ use super::lock;
 use super::losses::{Ends, loss};
 use crate::edge::clock::Clock;
 use crate::edge::secrets::Secrets;
-use crate::engine::connection::{Connection, Loss};
-use crate::engine::outbox::may_be_too_long;
+use crate::engine::connection::Connection;
 use crate::engine::settings::Mqtt;
 use crate::engine::time::Duration;
 use crate::engine::topics::Message;
@@ -108,23 +107,18 @@ impl<Tell: Fn(News)> Poller<Tell> {
         let longest = unconfirmed.max_by_key(|publish| publish.payload.len());
         let longest = longest.map(|publish| (publish.topic.clone(), publish.payload.len()));
         let now = self.clock.now();
-        let (was_made, pause, contested, closed_on) = {
+        let (was_made, after, contested) = {
             let mut connection = lock(&self.connection);
             let was_made = connection.is_made();
-            let closed_on = longest.filter(|_| was_made && loss(&error) == Loss::Closed);
-            let loss = match &closed_on {
-                Some((_, bytes)) if may_be_too_long(*bytes) => Loss::Choked,
-                _ => loss(&error),
-            };
-            let pause = connection.lost(now, loss, now.0);
-            (was_made, pause, connection.is_contested(now), closed_on)
+            let after = connection.lost(now, loss(&error), longest, now.0);
+            (was_made, after, connection.is_contested(now))
         };
         let reason = match contested {
             true => self.ends.contested(),
             false => self.ends.reason(&error, was_made),
         };
-        self.seen.send(Seen::Down { reason, contested, closed_on }).await?;
-        tokio::time::sleep(pause).await;
+        self.seen.send(Seen::Down { reason, contested, suspect: after.suspect }).await?;
+        tokio::time::sleep(after.pause).await;
         // Only now, when nobody hands over more: the library would send what it still holds before
         // anything newer, or drop it.
         self.event_loop.clean();
@@ -163,8 +157,8 @@ pub(super) enum Seen {
         reason: String,
         /// Somebody else takes this gateway's place again and again.
         contested: bool,
-        /// The longest message that the broker had not confirmed when it closed it, and its bytes.
-        closed_on: Option<(String, usize)>,
+        /// The topic and the bytes of a message that the broker may have closed it for.
+        suspect: Option<(String, usize)>,
     },
     /// Messages told once that the library had taken and the broker has not.
     Unsent(Vec<Message>),
