@@ -30,7 +30,9 @@ fn make_demo_shows_live_values_and_its_three_commands_do_what_they_say() {
     for (variable, _) in std::env::vars_os() {
         let name = variable.to_string_lossy();
         let is_of_make = ["MAKEFLAGS", "MFLAGS", "MAKELEVEL"].contains(&name.as_ref());
-        if is_of_make || name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_") {
+        let is_of_cargo =
+            name == "OUT_DIR" || name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_");
+        if is_of_make || is_of_cargo {
             command.env_remove(&variable);
         }
     }
