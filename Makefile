@@ -12,7 +12,7 @@ demo:
 # Every test that needs no large download. The program is built first as `make demo` builds it (without
 # what only tests need), so that the test of `make demo` waits for the demo and not for the compiler.
 test:
-	@$(WITH_MOSQUITTO) cargo build --locked && exec cargo test --locked
+	@$(WITH_MOSQUITTO) && cargo build --locked && exec cargo test --locked
 
 # The status page in a real Chromium, which is installed where it is missing. Pictures go to target/page.
 test-page:

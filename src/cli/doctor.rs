@@ -24,7 +24,7 @@ use crate::engine::yaml::Scalar;
 /// is heard is noise or another master. Nothing is sent unless `--send` asks for it. With `--listen 0s` not
 /// even the port's settings are touched. Ends with exit code 1 if something is wrong.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:
+#[command(after_help = "Examples:
   busker doctor --serial /dev/ttyUSB0 --baud 19200 --parity even
   busker doctor --config /etc/busker/busker.yaml")]
 pub struct Args {

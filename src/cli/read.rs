@@ -16,7 +16,7 @@ use crate::engine::value::Reading;
 /// --device, or with --profile, a point's name is understood as well.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  busker read --serial /dev/ttyUSB0 --baud 19200 --parity even --unit 18 'holding 0..3'
+  busker read --serial /dev/ttyUSB0 --baud 19200 --parity even --unit 18 'coil 0..3'
   busker read --tcp 192.168.1.20:502 --unit 1 'input 0..9' --json
   busker read --config busker.yaml --device heating_relays relay_1")]
 pub struct Args {

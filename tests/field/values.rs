@@ -76,7 +76,8 @@ fn orders() {
     let torn: Vec<u32> = told().into_iter().filter(|value| value >> 16 != value & 0xFFFF).collect();
     assert!(torn.is_empty(), "{torn:08X?}");
     stage.ends_well();
-    drop(stage);
+    // One that is killed would leave the terminal exclusive as long as the peer holds it.
+    assert!(stage.gateway.terminate().success());
 
     let by_hand = Command::new(program())
         .arg("read")
@@ -84,6 +85,7 @@ fn orders() {
         .args(["--unit", "1", "input 0..1", "--json"])
         .output()
         .expect("the program is built");
+    assert!(by_hand.status.success(), "{by_hand:?}");
     let found: serde_json::Value = serde_json::from_slice(&by_hand.stdout).expect("JSON");
     assert_eq!(found["pairs"][0]["f32"]["abcd"], 123.456, "{found}");
 }

@@ -1,6 +1,7 @@
 //! `busker simulate` as a person uses it: arguments, commands on its standard input, and its end; and
 //! the simulated devices against the profiles.
 
+mod examples;
 #[path = "../support/mod.rs"]
 mod support;
 mod two_readings;

@@ -1,7 +1,8 @@
 //! The demo's own mosquitto: started on a free port, ended with the demo however that ends.
 
 use std::env;
-use std::io::{BufRead, BufReader, Write};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Seek, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -10,6 +11,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use rustix::fs::{MemfdFlags, memfd_create};
 
 /// A free port may be taken by somebody else before mosquitto has it.
 const ATTEMPTS: usize = 5;
@@ -47,10 +49,14 @@ impl Mosquitto {
     }
 
     fn start_on(program: &Path, address: SocketAddr) -> anyhow::Result<Mosquitto> {
+        let configuration = format!(
+            "listener {} {}\nallow_anonymous true\npersistence false\nlog_dest stderr\n",
+            address.port(),
+            address.ip()
+        );
         let mut child = Command::new(program)
-            // The configuration comes through a pipe: there is no file to leave behind.
             .args(["-c", "/dev/stdin"])
-            .stdin(Stdio::piped())
+            .stdin(file_in_memory(&configuration).context("its configuration")?)
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
             // Not in the terminal's group: an interrupt is for the demo, which says goodbye first.
@@ -60,15 +66,6 @@ impl Mosquitto {
         let guard = Guard::over(&child).inspect_err(|_| {
             let _ = child.kill();
         })?;
-        let configuration = format!(
-            "listener {} {}\nallow_anonymous true\npersistence false\nlog_dest stderr\n",
-            address.port(),
-            address.ip()
-        );
-        if let Some(mut stdin) = child.stdin.take() {
-            // One that does not read it says why on standard error.
-            let _ = stdin.write_all(configuration.as_bytes());
-        }
         let (sender, log) = channel();
         if let Some(stderr) = child.stderr.take() {
             std::thread::spawn(move || {
@@ -128,6 +125,15 @@ impl Drop for Mosquitto {
         let _ = self.child.wait();
         self.guard.dismiss();
     }
+}
+
+/// There is no file to leave behind; and a pipe would not do, since mosquitto 2.0.21, which Debian 13 has,
+/// reads its configuration from nothing but files.
+fn file_in_memory(content: &str) -> std::io::Result<File> {
+    let mut file = File::from(memfd_create("mosquitto.conf", MemfdFlags::CLOEXEC)?);
+    file.write_all(content.as_bytes())?;
+    file.rewind()?;
+    Ok(file)
 }
 
 /// Ends mosquitto when this process is gone without having done so: a small shell that waits for a

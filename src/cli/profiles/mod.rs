@@ -49,6 +49,7 @@ enum What {
     /// Every fault of profile files, with its place
     #[command(after_help = "Example:\n  busker profiles check my-device.yaml")]
     Check {
+        /// The profiles
         #[arg(value_name = "FILE", required = true)]
         files: Vec<PathBuf>,
     },
