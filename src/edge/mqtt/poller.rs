@@ -56,8 +56,8 @@ impl<Tell: Fn(News)> Poller<Tell> {
         }
     }
 
-    /// What is to be told of it. What is for a bus is brought there. A question for its own sake is asked by the feeder, and its answer is nobody
-    /// else's business.
+    /// What is to be told of it. What is for a bus is brought there. A question for its own sake is asked by the
+    /// feeder, and its answer is nobody else's business.
     fn seen(&self, event: rumqttc::Event) -> Option<Seen> {
         let now = self.clock.now();
         let mut connection = lock(&self.connection);
