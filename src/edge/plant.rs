@@ -35,7 +35,7 @@ struct Parts {
 }
 
 impl Parts {
-    fn new(settings: Settings, library: Library) -> Parts {
+    fn new(settings: Settings, library: Library, stir: Arc<Stir>) -> Parts {
         let topics = Topics::of(&settings.mqtt);
         let outbox = Outbox::new(
             topics.clone(),
@@ -46,7 +46,7 @@ impl Parts {
         Parts {
             desk: Desk::new(&settings, library),
             topics,
-            mailbox: Arc::new(Mailbox::new(outbox)),
+            mailbox: Arc::new(Mailbox::new(outbox, stir)),
             buses: Vec::new(),
             connection: None,
             settings: Arc::new(settings),
@@ -57,12 +57,13 @@ impl Parts {
 impl Plant {
     /// As these settings want it, but with nothing running yet.
     pub fn new(settings: Settings, library: Library, clock: Clock) -> Plant {
-        Plant { clock, stir: Arc::default(), parts: Mutex::new(Parts::new(settings, library)) }
+        let stir = Arc::<Stir>::default();
+        Plant { clock, parts: Mutex::new(Parts::new(settings, library, stir.clone())), stir }
     }
 
     /// The same once more, with an empty mailbox.
     pub fn begin_anew(&self, settings: Settings, library: Library) {
-        *self.parts() = Parts::new(settings, library);
+        *self.parts() = Parts::new(settings, library, self.stir.clone());
     }
 
     /// The same mailbox and connection, and other settings.
