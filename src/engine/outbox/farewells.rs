@@ -70,7 +70,8 @@ impl Outbox {
         self.departed.is_announced(&present);
         let gone = self.departed.of(topic);
         self.bury(&gone, &present);
-        gone.iter().chain(&remembered).for_each(|gone| self.hold(gone, &present));
+        // What departed before that was held back then.
+        remembered.iter().for_each(|found| self.hold(found, &present));
     }
 
     /// Takes away once more what was taken away while Home Assistant may not have listened: it keeps
