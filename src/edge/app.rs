@@ -120,6 +120,8 @@ impl App {
     pub fn stop(self) {
         self.watch.abort();
         end_buses(&self.runtime, self.plant.buses());
+        // Also what is told only now.
+        store_what_is_told(&self.plant, &self.state.now(), self.clock.now());
         if let Some(broker) = self.broker {
             self.runtime.block_on(broker.finish(None));
         }
@@ -144,15 +146,12 @@ pub(super) fn remember_topics(plant: &Plant, state: &StateFiles) {
     state.store_trees(&plant.mailbox().look(|outbox| outbox.trees(told_on)));
 }
 
-/// Stores what the broker has been told, as far as it has most likely arrived.
+/// Stores what Home Assistant may have, and what is to be taken back at the broker as far as that has not arrived.
 fn store_what_is_told(plant: &Plant, state: &StateFiles, now: Time) {
     let mailbox = plant.mailbox();
-    mailbox.look(|outbox| {
-        if let Some(told) = outbox.announced() {
-            state.store_announced(&told);
-        }
-    });
-    if mailbox.settle(now) {
+    let has_less_to_take_back = mailbox.settle(now);
+    mailbox.look(|outbox| state.store_announced(&outbox.ledger()));
+    if has_less_to_take_back {
         remember_topics(plant, state);
     }
 }

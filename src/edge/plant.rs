@@ -42,11 +42,11 @@ pub(super) fn outbox(settings: &Settings) -> Outbox {
 }
 
 impl Parts {
-    fn new(settings: Settings, library: Library) -> Parts {
+    fn new(settings: Settings, library: Library, stir: Arc<Stir>) -> Parts {
         Parts {
             desk: Desk::new(&settings, library),
             topics: Topics::of(&settings.mqtt),
-            mailbox: Arc::new(Mailbox::new(outbox(&settings))),
+            mailbox: Arc::new(Mailbox::new(outbox(&settings), stir)),
             buses: Vec::new(),
             connection: None,
             settings: Arc::new(settings),
@@ -57,7 +57,8 @@ impl Parts {
 impl Plant {
     /// As these settings want it, but with nothing running yet.
     pub fn new(settings: Settings, library: Library, clock: Clock) -> Plant {
-        Plant { clock, stir: Arc::default(), parts: Mutex::new(Parts::new(settings, library)) }
+        let stir = Arc::<Stir>::default();
+        Plant { clock, parts: Mutex::new(Parts::new(settings, library, stir.clone())), stir }
     }
 
     /// The same mailbox and connection, and other settings.

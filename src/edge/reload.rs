@@ -205,7 +205,7 @@ impl App {
     /// the mailbox from now on is for the new one.
     fn leave_base_topic(&mut self, old: &Settings, new: &Settings) {
         let mailbox = self.plant.mailbox();
-        let rest = Arc::new(Mailbox::new(mailbox.exchange(plant::outbox(new))));
+        let rest = Arc::new(Mailbox::new(mailbox.exchange(plant::outbox(new)), self.plant.stir().clone()));
         let announced = rest.change(Outbox::take_back_everything);
         if let Some(broker) = self.broker.take() {
             self.runtime.block_on(broker.finish(Some(rest.clone())));

@@ -5,6 +5,7 @@ mod claim;
 mod shelf;
 mod writer;
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -22,7 +23,7 @@ use claim::lock_folder;
 pub use shelf::Shelf;
 use writer::Writer;
 
-/// What Home Assistant has been told of this gateway, in `state_dir`.
+/// What Home Assistant may have of this gateway, in `state_dir`.
 const ANNOUNCED: &str = "announced.json";
 
 /// On which topics something is told, and perhaps still has to be taken back.
@@ -47,7 +48,7 @@ struct Kept {
     damaged: Mutex<BTreeSet<String>>,
     /// Devices of which it has been said that nothing is remembered.
     unknown: Mutex<BTreeSet<String>>,
-    announced: Told<BTreeMap<String, String>>,
+    announced: Told<BTreeMap<String, Vec<String>>>,
     trees: Told<Vec<Tree>>,
 }
 
@@ -165,13 +166,13 @@ impl StateFiles {
         }
     }
 
-    /// What an earlier run has told Home Assistant, by topic; only once.
-    pub fn take_announced(&self) -> BTreeMap<String, String> {
+    /// What Home Assistant may have of earlier runs, by topic; only once.
+    pub fn take_announced(&self) -> BTreeMap<String, Vec<String>> {
         self.kept.as_ref().map_or_else(BTreeMap::new, |kept| kept.announced.take())
     }
 
-    /// Keeps what Home Assistant has been told, if it is not what is kept. Does not wait for that.
-    pub fn store_announced(&self, told: &BTreeMap<&str, &str>) {
+    /// Keeps what Home Assistant may have, if it is not what is kept. Does not wait for that.
+    pub fn store_announced(&self, told: &BTreeMap<&str, Vec<Cow<'_, str>>>) {
         if let Some(kept) = &self.kept {
             kept.announced.store(told, &kept.writer);
         }
@@ -370,13 +371,16 @@ mod tests {
         let path = folder.path().join(ANNOUNCED);
         let files = open();
         assert_eq!(files.take_announced(), BTreeMap::new());
-        files.store_announced(&BTreeMap::from([("a/config", "{}")]));
+        files.store_announced(&BTreeMap::from([("a/config", vec!["{}".into()])]));
         drop(files);
         let files = open();
-        assert_eq!(files.take_announced(), BTreeMap::from([("a/config".to_string(), "{}".to_string())]));
+        assert_eq!(
+            files.take_announced(),
+            BTreeMap::from([("a/config".to_string(), vec!["{}".to_string()])])
+        );
         // What is the same is not written again: it may lie on a memory card.
         fs::remove_file(&path).expect("it is there");
-        files.store_announced(&BTreeMap::from([("a/config", "{}")]));
+        files.store_announced(&BTreeMap::from([("a/config", vec!["{}".into()])]));
         drop(files);
         assert!(!path.exists());
         fs::write(&path, "{\"a/config\": 7").expect("a file");

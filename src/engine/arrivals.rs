@@ -66,9 +66,8 @@ impl Arrivals {
         let (topics, home_assistant) = (Topics::of(&settings.mqtt), &settings.home_assistant);
         let mut filters = topics.subscriptions();
         filters.extend(former_states.iter().cloned());
-        if home_assistant.discovery {
-            filters.push(home_assistant.status_topic.clone());
-        }
+        // Also without discovery: what was announced with it is forgotten when Home Assistant has heard that it is gone.
+        filters.push(home_assistant.status_topic.clone());
         // What an earlier run announced, to take away what is gone; all of it without discovery.
         filters.push(topics::discovery(&home_assistant.prefix, "+"));
         Arrivals { topics, former_states, status_topic: home_assistant.status_topic.clone(), filters }
@@ -157,8 +156,7 @@ mod tests {
             "homeassistant/device/+/config",
         ];
         assert_eq!(arrivals("").filters(), all);
-        let without = arrivals("home_assistant: {discovery: false}\n");
-        assert!(without.filters().iter().eq(all.iter().filter(|filter| !filter.ends_with("/status"))));
+        assert_eq!(arrivals("home_assistant: {discovery: false}\n").filters(), all);
     }
 
     /// `news` is what it is when it is told just now, `retained` when the broker has kept it.

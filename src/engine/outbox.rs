@@ -4,6 +4,7 @@
 
 mod arriving;
 mod claim;
+mod departed;
 mod farewells;
 mod former;
 mod held;
@@ -26,6 +27,7 @@ use crate::engine::topics::{self, Kind, Message, OFFLINE, ONLINE, Topics};
 use arriving::Arriving;
 pub use arriving::NotArriving;
 use claim::Claim;
+use departed::Departed;
 use former::Former;
 pub use former::Tree;
 use held::Held;
@@ -55,9 +57,8 @@ pub struct Outbox {
     own_devices: BTreeSet<String>,
     /// What an earlier run announced of devices that this one has not announced yet.
     remembered: BTreeMap<String, Announcement>,
-    /// What was taken away since Home Assistant last said that it listens. If it was not there to
-    /// hear, it is told again when it starts.
-    departed: BTreeMap<String, Announcement>,
+    departed: Departed,
+    has_new_announcement: bool,
     /// On which topics what was announced before was told; the broker shall forget those that are ours no more.
     left_behind: BTreeSet<String>,
     /// On these the devices tell something, if not yet: nothing is taken back there.
@@ -111,7 +112,8 @@ impl Outbox {
             discovery_prefix: format!("{discovery_prefix}/device/"),
             own_devices: own.collect(),
             remembered: BTreeMap::new(),
-            departed: BTreeMap::new(),
+            departed: Departed::default(),
+            has_new_announcement: false,
             left_behind: BTreeSet::new(),
             wanted: BTreeSet::new(),
             taken_back: TakenBack::default(),
@@ -237,6 +239,7 @@ impl Outbox {
     pub fn connected(&mut self) {
         self.is_connected = true;
         self.arriving.begin_anew();
+        self.held.broker_is_there();
         self.doubt_what_was_taken_back();
         self.push_retained(Message::retained(self.topics.bridge_state(), ONLINE));
         let mut once: Vec<Message> = Vec::new();
@@ -279,13 +282,15 @@ impl Outbox {
         self.arriving.begin_anew();
         self.too_long.wait();
         self.doubt_what_was_taken_back();
+        self.departed.doubt();
         self.formers_due = None;
     }
 
     /// Home Assistant has started: it is told of all devices now, and of all values when it has had
     /// the time to listen ([`Outbox::wake_at`]).
     pub fn home_assistant_started(&mut self, now: Time) {
-        self.take_leave_again();
+        self.held.home_assistant_is_there();
+        self.take_leave_again(now);
         self.queue_again(|rank| rank == Rank::Discovery);
         self.states_due_at = Some(now + STATES_AFTER_DISCOVERY);
     }
@@ -342,13 +347,15 @@ impl Outbox {
     fn push_retained(&mut self, mut message: Message) {
         // It is kept, and text that was written bit by bit has room for as much again.
         message.payload.shrink_to_fit();
+        let is_announcement = message.topic.starts_with(&self.discovery_prefix);
         if let Some(entry) = self.retained.get_mut(&*message.topic) {
             let before = std::mem::replace(&mut entry.payload, message.payload);
+            self.has_new_announcement |= is_announcement && entry.payload != before;
             if !std::mem::replace(&mut entry.queued, true) {
                 self.queue_last(Queued::Newest(message.topic.as_str().into()));
             }
-            if message.topic.starts_with(&self.discovery_prefix) {
-                self.hold_back(&message.topic, &before);
+            if is_announcement {
+                self.replaced(&message.topic, &before);
             }
         } else {
             let topic: Arc<str> = message.topic.as_str().into();
@@ -363,9 +370,10 @@ impl Outbox {
             self.next_number += 1;
             self.retained.insert(topic.clone(), entry);
             self.queue_last(Queued::Newest(topic));
-        }
-        if let Some(found) = self.remembered.remove(&message.topic) {
-            self.take_leave(found);
+            if is_announcement {
+                self.has_new_announcement = true;
+                self.take_leave_of_earlier_runs(&message.topic);
+            }
         }
     }
 

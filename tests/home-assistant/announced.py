@@ -148,6 +148,9 @@ def announced(retained: dict[str, str]) -> dict[str, Announced]:
             continue
         message = json.loads(payload)
         for component in message["components"].values():
+            if "unique_id" not in component:
+                # A tombstone, heard by who was there; what is announced follows at once.
+                continue
             one = Announced(message, component, retained)
             if one.unique_id in found:
                 raise Fault(f"{one.unique_id} is announced twice")

@@ -201,7 +201,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 }
             }
             Arrival::HomeAssistantStarted => {
-                tracing::info!("Home Assistant has started: announcing all devices again");
+                tracing::info!("Home Assistant is there: it is told of everything again");
                 self.mailbox.outbox().home_assistant_started(self.clock.now());
             }
             Arrival::Announcement { is_news } => {

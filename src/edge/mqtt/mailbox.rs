@@ -1,10 +1,11 @@
 //! What waits for the broker, where every thread can reach it.
 
-use std::sync::{Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio::sync::Notify;
 
 use crate::edge::lock::lock;
+use crate::edge::stir::Stir;
 use crate::engine::outbox::Outbox;
 use crate::engine::time::Time;
 use crate::engine::topics::Message;
@@ -13,23 +14,30 @@ use crate::engine::topics::Message;
 pub struct Mailbox {
     outbox: Mutex<Outbox>,
     pub(super) news: Notify,
+    /// Stirred by what is worth remembering.
+    stir: Arc<Stir>,
 }
 
 impl Mailbox {
-    pub fn new(outbox: Outbox) -> Mailbox {
-        Mailbox { outbox: Mutex::new(outbox), news: Notify::new() }
+    pub fn new(outbox: Outbox, stir: Arc<Stir>) -> Mailbox {
+        Mailbox { outbox: Mutex::new(outbox), news: Notify::new(), stir }
     }
 
     /// Never waits for the broker.
     pub fn push(&self, message: Message) {
-        self.outbox().push(message);
-        self.news.notify_one();
+        self.change(|outbox| outbox.push(message));
     }
 
     /// Does something with all that waits or is remembered.
     pub fn change<T>(&self, change: impl FnOnce(&mut Outbox) -> T) -> T {
-        let result = change(&mut self.outbox());
+        let mut outbox = self.outbox();
+        let result = change(&mut outbox);
+        let is_worth_remembering = outbox.is_worth_remembering();
+        drop(outbox);
         self.news.notify_one();
+        if is_worth_remembering {
+            self.stir.stir();
+        }
         result
     }
 

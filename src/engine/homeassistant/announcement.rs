@@ -112,9 +112,32 @@ impl Announcement {
 
     /// The keys and platforms of the components.
     pub fn components(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.components.iter().map(|(key, component)| {
-            (key.as_str(), component.get("platform").and_then(Value::as_str).unwrap_or_default())
-        })
+        self.components.iter().map(|(key, component)| (key.as_str(), platform(component)))
+    }
+
+    /// What of it `present` does not have: what stands under other keys, or is another platform. As of the device
+    /// that `present` announces; `None` if that is nothing.
+    pub fn without(&self, present: &Announcement) -> Option<Announcement> {
+        let kept: BTreeMap<&str, &str> = present.components().collect();
+        let is_gone = |key: &str, component: &Map<String, Value>| kept.get(key) != Some(&platform(component));
+        let gone = self.components.iter().filter(|(key, component)| is_gone(key, component));
+        let components: Components = gone.cloned().collect();
+        let head = present.head.clone();
+        (!components.is_empty()).then(|| Announcement { topic: self.topic.clone(), head, components })
+    }
+
+    /// Takes in what `other` has, in the place of what is the same here. Returns what cannot be told in one message
+    /// with it, since the key means another platform here.
+    pub fn join(&mut self, other: Announcement) -> Option<Announcement> {
+        let mut apart = Announcement { components: Vec::new(), ..other.clone() };
+        for (key, component) in other.components {
+            match self.components.iter_mut().find(|(here, _)| *here == key) {
+                None => self.components.push((key, component)),
+                Some((_, here)) if platform(here) == platform(&component) => *here = component,
+                Some(_) => apart.components.push((key, component)),
+            }
+        }
+        (!apart.is_empty()).then_some(apart)
     }
 
     /// The topics on which what it announces is told.
@@ -189,6 +212,10 @@ pub fn announcer(payload: &str) -> Option<String> {
     let components = announced["components"].as_object().into_iter().flatten();
     let mut named = available_by.chain(components.map(|(_, component)| &component["state_topic"]));
     named.find_map(|topic| Topics::base_of_state(topic.as_str()?)).map(str::to_string)
+}
+
+fn platform(component: &Map<String, Value>) -> &str {
+    component.get("platform").and_then(Value::as_str).unwrap_or_default()
 }
 
 /// What decides of a component which values are right for it: Home Assistant logs a warning for a name that is no

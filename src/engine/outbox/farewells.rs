@@ -2,6 +2,7 @@
 //! nobody was there to hear.
 
 use crate::engine::homeassistant::{self, Announcement};
+use crate::engine::time::Time;
 use crate::engine::topics::{DeviceTopics, Message};
 
 use super::{Outbox, Queued};
@@ -27,10 +28,16 @@ impl Outbox {
         if self.retained.contains_key(topic) {
             self.take_leave(found);
         } else if self.own_devices.contains(topic) {
+            if let Some(earlier) = self.remembered.remove(topic) {
+                earlier.without(&found).into_iter().for_each(|gone| self.departed.add(gone));
+            }
             self.remembered.insert(topic.to_string(), found);
-        } else if self.departed.insert(topic.to_string(), found).is_none() {
+        } else {
             // Not twice, if both the broker and we remember it: Home Assistant warns of the second time.
-            self.queue_last(Queued::Removal(topic.to_string()));
+            if !self.departed.has(topic) {
+                self.queue_last(Queued::Removal(topic.to_string()));
+            }
+            self.departed.add(found);
         }
     }
 
@@ -48,32 +55,56 @@ impl Outbox {
 
     /// Buries what `found` has and the present announcement on its topic has not.
     pub(super) fn take_leave(&mut self, found: Announcement) {
-        let Some(entry) = self.retained.get(found.topic()) else { return };
-        let message = Message::retained(found.topic(), entry.payload.clone());
-        let Some(present) = Announcement::parse(&self.topics, &message.topic, &message.payload) else {
-            return;
-        };
-        if let Some(farewell) = homeassistant::farewell(&found, &present) {
-            // Home Assistant may have started since then, and buries only what it knows.
-            self.push_once(Message { retain: false, ..found.message() });
-            self.push_once(farewell);
-            self.push_retained(message);
-            self.departed.insert(found.topic().to_string(), found.clone());
+        let Some(present) = self.announced_on(found.topic()) else { return };
+        if let Some(gone) = found.without(&present) {
+            self.bury(std::slice::from_ref(&gone), &present);
+            self.departed.add(gone);
         }
         self.hold(&found, &present);
     }
 
+    /// This is announced for the first time in this run, and earlier ones may have announced something else.
+    pub(super) fn take_leave_of_earlier_runs(&mut self, topic: &str) {
+        let remembered = self.remembered.remove(topic);
+        let Some(present) = self.announced_on(topic) else { return };
+        if let Some(gone) = remembered.as_ref().and_then(|found| found.without(&present)) {
+            self.departed.add(gone);
+        }
+        self.departed.is_announced(&present);
+        let gone = self.departed.of(topic);
+        self.bury(&gone, &present);
+        // What departed before that was held back then.
+        remembered.iter().for_each(|found| self.hold(found, &present));
+    }
+
     /// Takes away once more what was taken away while Home Assistant may not have listened: it keeps
     /// entities over its own restart, and lets go only of what it has been told since.
-    pub(super) fn take_leave_again(&mut self) {
-        for (topic, found) in std::mem::take(&mut self.departed) {
-            if self.retained.contains_key(&*topic) {
-                self.take_leave(found);
-                self.departed.remove(&topic);
+    pub(super) fn take_leave_again(&mut self, now: Time) {
+        for topic in self.departed.topics() {
+            let gone = self.departed.of(&topic);
+            if let Some(present) = self.announced_on(&topic) {
+                self.bury(&gone, &present);
+                gone.iter().for_each(|gone| self.hold(gone, &present));
+            } else if self.own_devices.contains(&topic) {
+                // That is done when it is announced.
+                continue;
             } else {
-                self.push_once(Message { retain: false, ..found.message() });
-                self.queue_last(Queued::Removal(topic));
+                gone.iter().for_each(|gone| self.push_once(Message { retain: false, ..gone.message() }));
+                self.queue_last(Queued::Removal(topic.clone()));
             }
+            self.departed.is_told(&topic, now);
+        }
+    }
+
+    /// Takes these away from beside what is announced now.
+    fn bury(&mut self, gone: &[Announcement], present: &Announcement) {
+        for gone in gone {
+            // Home Assistant may have started since then, and buries only what it knows.
+            self.push_once(Message { retain: false, ..gone.message() });
+            homeassistant::farewell(gone, present).into_iter().for_each(|farewell| self.push_once(farewell));
+        }
+        if !gone.is_empty() {
+            self.push_retained(present.message());
         }
     }
 }
@@ -160,9 +191,9 @@ mod tests {
         let config = "homeassistant/device/busker_boiler/config";
         let (old, new) = (announcement(&["flow", "level"]), announcement(&["level"]));
         // `flow` stands there as a tombstone, behind what is left.
-        let farewell = announcement(&["level", "flow"]);
+        let (gone, farewell) = (announcement(&["flow"]), announcement(&["level", "flow"]));
         let expected =
-            [format!("{config} {old}!"), format!("{config} {farewell}!"), format!("{config} {new}")];
+            [format!("{config} {gone}!"), format!("{config} {farewell}!"), format!("{config} {new}")];
         let expected: Vec<&str> = expected.iter().map(String::as_str).collect();
 
         // Found before it is announced anew, and after.
@@ -200,15 +231,16 @@ mod tests {
         outbox.found(gone, &old);
         take_all(&mut outbox);
         outbox.home_assistant_started(Time::from_millis(0));
-        let farewell = announcement(&["level", "flow"]);
+        let (flow, farewell) = (announcement(&["flow"]), announcement(&["level", "flow"]));
         let expected = [
-            format!("{config} {old}!"),
+            format!("{config} {flow}!"),
             format!("{config} {farewell}!"),
             format!("{config} {new}"),
             format!("{gone} {old}!"),
             format!("{gone} "),
         ];
         check_sent(&mut outbox, &expected.each_ref().map(String::as_str));
+        outbox.settle(Time::from_millis(60_000));
         outbox.home_assistant_started(Time::from_millis(60_000));
         check_sent(&mut outbox, &[&expected[2]]);
     }

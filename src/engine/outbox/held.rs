@@ -1,12 +1,22 @@
 //! Values of what is announced as something else than before: Home Assistant takes its time to follow, and until then
-//! it would read the new value as the old thing, which may be none that it takes.
+//! it would read the new value as the old thing, which may be none that it takes. It never says that it has followed;
+//! only that it is there, when it has connected to the broker. So two times are waited for: the longer one where it
+//! may still have to connect, and would read what the broker keeps before it hears of anything else.
 
 use std::collections::BTreeSet;
 
-use super::{Lane, Outbox, Queued, STATES_AFTER_DISCOVERY};
+use super::{Lane, Outbox, Queued};
 use crate::engine::homeassistant::Announcement;
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 use crate::engine::topics::{Kind, Message};
+
+/// Within this time a Home Assistant that is there follows. It does what it is told in the order in which it is told,
+/// and so did one that stood still for three seconds when the value came after half of that; this is ample.
+pub(super) const FOLLOWS_WITHIN: Duration = Duration::from_secs(5);
+
+/// Within this time after its broker is there again, Home Assistant is connected and has said so: it tries every ten
+/// seconds, and waits until nothing has been announced for five.
+pub(super) const CONNECTS_WITHIN: Duration = Duration::from_secs(25);
 
 /// What waits until Home Assistant knows what it is. Meanwhile nothing is known of it.
 #[derive(Clone, Debug, Default)]
@@ -14,6 +24,18 @@ pub(super) struct Held {
     topics: BTreeSet<String>,
     /// When it knows, once it has been told.
     due: Option<Time>,
+    home: Home,
+}
+
+/// Whether Home Assistant is there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum Home {
+    /// The broker has just come, or this gateway has: it may come as well.
+    #[default]
+    MayCome,
+    /// If it has not come by then, it was there all the time, or there is none.
+    ComesBefore(Time),
+    IsThere,
 }
 
 impl Held {
@@ -24,30 +46,34 @@ impl Held {
 
     /// Something is told now, perhaps what things are. The announcement itself may be too long to be told ever.
     pub(super) fn is_told(&mut self, now: Time, is_announcement: bool) {
-        if !self.topics.is_empty() && (is_announcement || self.due.is_none()) {
-            self.due = Some(now + STATES_AFTER_DISCOVERY);
+        if self.home == Home::MayCome {
+            self.home = Home::ComesBefore(now + CONNECTS_WITHIN);
         }
+        if !self.topics.is_empty() && (is_announcement || self.due.is_none()) {
+            let follows = now + FOLLOWS_WITHIN;
+            self.due = Some(match self.home {
+                Home::ComesBefore(time) => follows.max(time),
+                Home::MayCome | Home::IsThere => follows,
+            });
+        }
+    }
+
+    /// Home Assistant has said so.
+    pub(super) fn home_assistant_is_there(&mut self) {
+        self.home = Home::IsThere;
+    }
+
+    /// The broker was away, and Home Assistant's connection with it.
+    pub(super) fn broker_is_there(&mut self) {
+        self.home = Home::MayCome;
     }
 
     pub(super) fn due(&self) -> Option<Time> {
         self.due
     }
-
-    pub(super) fn is_empty(&self) -> bool {
-        self.topics.is_empty()
-    }
 }
 
 impl Outbox {
-    /// What stood on this discovery topic is replaced by what stands there now.
-    pub(super) fn hold_back(&mut self, topic: &str, before: &str) {
-        let Some(entry) = self.retained.get(topic).filter(|entry| entry.payload != before) else { return };
-        let parse = |payload: &str| Announcement::parse(&self.topics, topic, payload);
-        if let (Some(before), Some(now)) = (parse(before), parse(&entry.payload)) {
-            self.hold(&before, &now);
-        }
-    }
-
     /// Holds back what `now` makes something else of than `before` did.
     pub(super) fn hold(&mut self, before: &Announcement, now: &Announcement) {
         let topics = now.told_otherwise_than(before).into_iter();
@@ -138,8 +164,8 @@ mod tests {
         outbox.connected();
         let online = "busker/bridge/state online";
         check_sent(&mut outbox, &[&expected[..], &[online]].concat());
-        assert_eq!(outbox.announced(), None, "not all is told");
         let due = outbox.wake_at().expect("it is told later");
+        assert!(due >= LATER + CONNECTS_WITHIN, "Home Assistant may connect later than this gateway");
         outbox.wake(LATER);
         check_sent(&mut outbox, &[]);
         outbox.wake(due);
@@ -159,9 +185,29 @@ mod tests {
         check_held(running, &now);
         // Of an earlier run.
         let mut started = outbox();
-        let recalled = BTreeMap::from([(CONFIG.to_string(), before)]);
+        let recalled = BTreeMap::from([(CONFIG.to_string(), vec![before])]);
         started.recall(recalled, Vec::new(), &BTreeSet::new());
         check_held(started, &now);
+    }
+
+    #[test]
+    fn a_home_assistant_that_has_said_that_it_is_there_is_not_waited_for() {
+        let (before, now) = before_and_now();
+        let mut outbox = outbox();
+        retained(&mut outbox, CONFIG, &before);
+        retained(&mut outbox, "busker/boiler/since", "7");
+        outbox.connected();
+        super::super::tests::take_all(&mut outbox);
+        outbox.home_assistant_started(LATER);
+        outbox.wake(LATER + Duration::from_secs(2));
+        super::super::tests::take_all(&mut outbox);
+        retained(&mut outbox, CONFIG, &now);
+        retained(&mut outbox, "busker/boiler/since", MOMENT);
+        check_sent(&mut outbox, &["busker/boiler/since None", &format!("{CONFIG} {now}")]);
+        let due = outbox.wake_at().expect("it is told later");
+        assert!(due < LATER + FOLLOWS_WITHIN + Duration::from_secs(1), "{due:?}");
+        outbox.wake(due);
+        check_sent(&mut outbox, &[&format!("busker/boiler/since {MOMENT}")]);
     }
 
     #[test]

@@ -69,8 +69,16 @@ impl Outbox {
                 self.taken_back.add(&topic);
             }
         }
-        let own = &self.own_devices;
-        self.remembered.retain(|topic, _| own.contains(topic));
+        // What has not been announced in this run was in an earlier one.
+        let is_gone = |topic: &&String| !self.own_devices.contains(*topic);
+        let gone: Vec<String> = self.remembered.keys().filter(is_gone).cloned().collect();
+        for topic in gone {
+            if let Some(found) = self.remembered.remove(&topic) {
+                self.push_once(Message { retain: false, ..found.message() });
+                self.take_back(&topic);
+                self.departed.add(found);
+            }
+        }
         let is_told = |topic: &str| self.retained.contains_key(topic);
         self.arriving.keep(is_told);
         self.meet_rivals();
@@ -88,11 +96,11 @@ impl Outbox {
 
     /// The gateway will be another one: nothing that it told stays at the broker, but that it is offline.
     /// Returns the announcements that stood until now, by topic, told already or not.
-    pub fn take_back_everything(&mut self) -> BTreeMap<String, String> {
+    pub fn take_back_everything(&mut self) -> BTreeMap<String, Vec<String>> {
         // First what Home Assistant was announced, so that nobody reads anything out of the empty messages.
         let announced = self.in_order(|rank| rank == Rank::Discovery);
         let others = self.in_order(|rank| rank != Rank::Discovery && rank != Rank::BridgeState);
-        let payload = |topic: &Arc<str>| (topic.to_string(), self.retained[topic].payload.clone());
+        let payload = |topic: &Arc<str>| (topic.to_string(), vec![self.retained[topic].payload.clone()]);
         let stood = announced.iter().map(payload).collect();
         for topic in announced.into_iter().chain(others) {
             self.take_back(&topic);
@@ -105,53 +113,41 @@ impl Outbox {
     /// That this gateway is offline stands there still.
     pub fn legacy(
         &self,
-        announced: BTreeMap<String, String>,
+        announced: BTreeMap<String, Vec<String>>,
         told_on: BTreeSet<String>,
-    ) -> (BTreeMap<String, String>, Vec<Tree>) {
+    ) -> (BTreeMap<String, Vec<String>>, Vec<Tree>) {
         if self.is_empty() {
-            // Everything has been taken back.
+            // Everything has been taken back, but Home Assistant may not have heard of all that departed before.
+            let departed = self.departed.topics().into_iter().map(|topic| {
+                let parts = self.departed.of(&topic);
+                (topic, parts.iter().map(|part| part.message().payload).collect())
+            });
             let present = Tree { base_topic: self.topics.base().into(), topics: BTreeSet::new() };
-            (BTreeMap::new(), std::iter::once(present).chain(self.former_trees()).collect())
+            (departed.collect(), std::iter::once(present).chain(self.former_trees()).collect())
         } else {
             (announced, self.trees(told_on))
         }
     }
 
-    /// What Home Assistant has been told of everything that this gateway has, by topic; `None` while it has not
-    /// been told all of it yet. Worth remembering: a broker may forget it, and Home Assistant does not.
-    pub fn announced(&self) -> Option<BTreeMap<&str, &str>> {
-        let is_told = self.is_connected
-            && self.is_empty()
-            && self.formers.is_empty()
-            && self.remembered.is_empty()
-            && self.states_due_at.is_none()
-            && self.held.is_empty();
-        let own = self.own_devices.iter();
-        let told = own.filter_map(|topic| {
-            let entry = self.retained.get(topic.as_str())?;
-            Some((topic.as_str(), entry.payload.as_str()))
-        });
-        is_told.then(|| told.collect())
-    }
-
     /// What an earlier run has announced, and the broker may have forgotten. What is there no more is announced
     /// once again and taken away then: Home Assistant lets go only of what it has been told since its start.
-    pub(super) fn recall_announcement(&mut self, topic: &str, payload: &str) {
-        let is_gone = !self.own_devices.contains(topic);
-        if let Some(found) = Announcement::parse(&self.topics, topic, payload).filter(|_| is_gone) {
-            self.push_once(Message { retain: false, ..found.message() });
+    pub(super) fn recall_announcements(&mut self, topic: &str, payloads: &[String]) {
+        if !self.own_devices.contains(topic) {
+            for payload in payloads {
+                if let Some(found) = Announcement::parse(&self.topics, topic, payload) {
+                    self.push_once(Message { retain: false, ..found.message() });
+                }
+            }
         }
-        self.found(topic, payload);
+        // The first is what was announced last.
+        payloads.iter().rev().for_each(|payload| self.found(topic, payload));
     }
 
     fn take_back_announcement(&mut self, topic: &str) {
-        let found = self.retained.get(topic);
-        let found = found.and_then(|entry| Announcement::parse(&self.topics, topic, &entry.payload));
+        let found = self.announced_on(topic);
         self.take_back(topic);
-        if let Some(found) = found {
-            // If Home Assistant is not there to hear it, it is told again when it starts.
-            self.departed.insert(topic.to_string(), found);
-        }
+        // If Home Assistant is not there to hear it, it is told again when it starts.
+        found.into_iter().for_each(|found| self.departed.add(found));
     }
 
     fn take_back(&mut self, topic: &str) {
@@ -294,7 +290,7 @@ mod tests {
         let (mut outbox, told_on) = (outbox(), BTreeSet::from(["busker/boiler/flow".to_string()]));
         let announced = outbox.take_back_everything();
         let boiler = "homeassistant/device/busker_boiler/config";
-        assert_eq!((announced.len(), announced[boiler].as_str()), (3, "{}"));
+        assert_eq!((announced.len(), &announced[boiler]), (3, &vec!["{}".to_string()]));
         let (of_boiler, trees) = outbox.legacy(announced.clone(), told_on.clone());
         assert_eq!(of_boiler, announced);
         assert_eq!(trees, [Tree { base_topic: "busker".into(), topics: told_on.clone() }]);
@@ -329,15 +325,14 @@ mod tests {
         let [boiler, pump] =
             ["boiler", "pump"].map(|device| format!("homeassistant/device/busker_{device}/config"));
         let mut outbox = Outbox::new(Topics::new("busker"), "homeassistant", ["busker_boiler".to_string()]);
-        outbox.recall_announcement(&boiler, &announcement(&["flow", "level"]));
-        outbox.recall_announcement(&pump, &announcement(&["speed"]));
-        outbox.recall_announcement("homeassistant/device/strange/config", "{}");
-        assert_eq!(outbox.announced(), None, "not all of it is told");
+        outbox.recall_announcements(&boiler, &[announcement(&["flow", "level"])]);
+        outbox.recall_announcements(&pump, &[announcement(&["speed"])]);
+        outbox.recall_announcements("homeassistant/device/strange/config", &["{}".to_string()]);
         let present = announcement(&["level"]);
         outbox.push(Message::retained(boiler.clone(), present.clone()));
         outbox.connected();
         let expected = [
-            format!("{boiler} {}", announcement(&["flow", "level"])),
+            format!("{boiler} {}", announcement(&["flow"])),
             format!("{boiler} {}", announcement(&["level", "flow"])),
             format!("{boiler} {present}"),
             format!("{pump} {}", announcement(&["speed"])),
@@ -348,9 +343,5 @@ mod tests {
         // The broker had not forgotten it after all.
         outbox.found(&pump, &announcement(&["speed"]));
         assert_eq!(sent(&mut outbox), [""; 0], "once is enough");
-        let told = outbox.announced().expect("all of it is told");
-        assert_eq!(told, BTreeMap::from([(boiler.as_str(), present.as_str())]));
-        outbox.disconnected();
-        assert_eq!(outbox.announced(), None, "the last of it may not have arrived");
     }
 }

@@ -197,7 +197,7 @@ impl Outbox {
             Some(Place::Disputed(_)) | None => None,
         };
         self.remembered.remove(topic);
-        self.departed.remove(topic);
+        self.departed.forget(topic);
         self.queue.forget(self.lane(topic), topic);
         self.await_no_return(topic);
         let ours = self.retained.remove(topic).map(|entry| entry.payload).or(withheld);
@@ -285,7 +285,7 @@ mod tests {
         outbox.found(CONFIG, &announcement("house", &["flow"]));
         check_sent(&mut outbox, &["busker/boiler/flow 21.5", "busker/bridge/state online"]);
         check_news(&mut outbox, &[]);
-        assert!(outbox.announced().is_some_and(|told| told.is_empty()));
+        assert!(outbox.ledger().is_empty());
         // Nor is it taken back as if it were ours.
         let mut ending = outbox.clone();
         ending.take_back_everything();

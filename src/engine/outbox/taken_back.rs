@@ -41,7 +41,11 @@ impl Outbox {
     /// Whether [`Outbox::trees`] are fewer than before, since what was taken back has arrived, or is somebody
     /// else's now. Told once; to be asked now and then.
     pub fn settle(&mut self, now: Time) -> bool {
-        if !self.is_empty() || now < self.taken_back.handed_over_at + ARRIVES_WITHIN {
+        if !self.is_empty() {
+            return false;
+        }
+        self.departed.settle(now);
+        if now < self.taken_back.handed_over_at + ARRIVES_WITHIN {
             return false;
         }
         let has_arrived = !std::mem::take(&mut self.taken_back.topics).is_empty();

@@ -5,7 +5,8 @@ from steps.changes import a_neighbour_stays, names, nobody_is_gone, nobody_liste
 from steps.controls import devices_are_seen, devices_obey, eeprom_is_spared, every_button, every_control, every_service
 from steps.edges import edge_values
 from steps.first_sight import everything_is_enabled, everything_is_there, the_wire_is_seen
-from steps.identity import addresses, nothing_is_announced, points_go
+from steps.gone import points_change_slowly, points_go, points_go_unseen
+from steps.identity import addresses, nothing_is_announced
 from steps.many import thousands_of_points
 from steps.modes import a_damper_moves, a_valve_moves, an_event_arrives, every_mode, every_thing
 from steps.restarts import other_topics, restarts, the_broker_returns_alone
@@ -16,7 +17,8 @@ STEPS = [
     an_event_arrives, every_mode, every_thing, the_wire_is_seen, a_damper_moves, a_valve_moves,
     every_service,
     restarts, the_broker_returns_alone, other_topics,
-    nobody_listens, nobody_is_gone, a_neighbour_stays, points_go, addresses, names, the_end,
+    nobody_listens, nobody_is_gone, a_neighbour_stays, points_go, points_go_unseen, points_change_slowly,
+    addresses, names, the_end,
     nothing_is_announced,
     every_class, thousands_of_points,
 ]

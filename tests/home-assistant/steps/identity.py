@@ -6,7 +6,7 @@ from calls import Call
 from fault import Deadline, same
 from house import House
 from plant import connected
-from steps.devices import DO4, VALVE
+from steps.devices import DO4
 
 
 def ids(house: House, but: str = " ") -> dict[str, tuple]:
@@ -105,62 +105,6 @@ def backwards(profile: str) -> str:
     """The profile with its points in the other order."""
     before, points, after = re.fullmatch(r"(.*\npoints:\n)((?:  \w+: \{[^\n]*\n)+)(.*)", profile, re.DOTALL).groups()
     return before + "".join(reversed(points.splitlines(keepends=True))) + after
-
-
-def points_go(house: House) -> None:
-    """Points are taken out of a profile, and become something else, whoever is there to notice."""
-    profile = house.busker.own_profiles / "test" / "valve.yaml"
-    whole = profile.read_text()
-    fewer, count = re.subn(r"  (running_time|next_service|label): .*\n", "", whole)
-    same(count, 3, "the points that go")
-    # What was a number is a sensor from now on, and what was a sensor, a number; nothing is in EEPROM any more.
-    less = fewer.replace("poll: slow, write: 0..600, persistent: true, default: 0}", "poll: slow}")
-    less = less.replace("points:\n", "points:\n  last_serviced: {at: holding 4, type: u32, poll: slow, write: 0..9}\n", 1)
-    less = re.sub(r"  last_serviced: \{at: input.*\n", "", less)
-    others = {"closes_after": "sensor", "last_serviced": "number"}
-    went = {f"{VALVE}_{name}" for name in ("running_time", "next_service", "label")}
-    everything, broker, gateway, home = house.settle(), house.broker, house.gateway, house.home
-    same(went - set(everything), set(), "what is there and will go")
-    ways = {
-        "it reloads": [gateway.reload],
-        "it starts anew": [gateway.stop, gateway.start],
-        "it and Home Assistant start anew": [gateway.stop, home.stop, home.start, gateway.start],
-        "it starts anew while Home Assistant is stopped": [home.stop, gateway.stop, gateway.start, house.is_told, home.start],
-        "it starts anew with a broker that has forgotten everything": [gateway.stop, lambda: broker.stop(True), broker.start, gateway.start],
-        "it starts anew with a broker that has forgotten everything, while Home Assistant is stopped":
-            [home.stop, gateway.stop, lambda: broker.stop(True), broker.start, gateway.start, house.is_told, home.start],
-        "it reloads while the broker is stopped, which forgets everything":
-            [lambda: broker.stop(True), gateway.reload, broker.start],
-    }
-    for way, parts in ways.items():
-        # With a broker that has forgotten what was announced nothing becomes something else.
-        changed = fewer if "forg" in way else less
-        for text in (changed, whole):
-            is_changed = False
-            for part in parts:
-                # When the gateway looks at it next, it is another one.
-                if not is_changed and part in (gateway.start, gateway.reload):
-                    profile.write_text(text)
-                    is_changed = True
-                part()
-            deadline = Deadline(f"what the profile says now is announced when {way}")
-            while (went <= set(now := house.settle())) is not (text is whole):
-                deadline.pass_by()
-            wanted = {key: one.platform for key, one in everything.items() if one.identity == VALVE}
-            if text is not whole:
-                wanted = {key: platform for key, platform in wanted.items() if key not in went}
-            if text is less:
-                wanted |= {f"{VALVE}_{name}": platform for name, platform in others.items()}
-                del wanted[f"{VALVE}_eeprom_writes"]
-            same({key: one.platform for key, one in now.items() if one.identity == VALVE}, wanted, f"what is there when {way}")
-            house.log_is_empty()
-        print(f"  {way}", flush=True)
-    house.report.row(
-        "three points are taken out of a profile, and back: while busker reloads, while it is stopped, also with Home Assistant stopped or "
-        "started anew meanwhile, and with a broker that forgets everything; where it does not, a number becomes a sensor, and a moment a number",
-        f"in each of {len(ways)} ways all that went is gone from Home Assistant, what became something else is there once, and back "
-        "again everything is as before",
-    )
 
 
 def nothing_is_announced(house: House) -> None:
