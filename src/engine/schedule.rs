@@ -44,8 +44,9 @@ struct Planned {
     sleeps: bool,
 }
 
-/// For so long what nobody has answered waits behind everything that is overdue; on a bus that is never
-/// done with that its turn comes nevertheless.
+/// For so long what nobody has answered waits behind everything that is due, also behind what has had more than its
+/// share: or a device that dies would keep the line from it twice in a row. On a bus that is never done with that
+/// its turn comes nevertheless.
 const REPEATED_BEHIND: Duration = Duration::from_secs(2);
 
 /// A read that comes at least so often, and has been answered so often since its device connected, holds no
@@ -394,8 +395,8 @@ impl Polls {
     }
 
     /// Nothing came of the read, for the moment. It is the next that is asked, if it `goes_first`; else it is due at
-    /// once, but goes before nothing that is more overdue: a device that dies must not keep the line from all
-    /// others until it counts as dead.
+    /// once, but goes before nothing else that is due: a device that dies must not keep the line from all others
+    /// until it counts as dead.
     pub fn try_again(&mut self, index: usize, now: Time, goes_first: bool) {
         let planned = &mut self.reads[index];
         planned.answers = planned.answers.min(ANSWERS_WELL_KNOWN - ANSWERS_TO_FORGIVE);
@@ -531,7 +532,7 @@ impl Planned {
         let waiting = self.waiting()?;
         if self.is_repeated {
             let waited = (now - waiting.began_at).saturating_sub(REPEATED_BEHIND);
-            return Some(Urgency::Overdue(periods(waited, waiting.period).max(1.0)));
+            return Some(Urgency::Overdue(periods(waited, waiting.period)));
         }
         waiting.urgency(now).map(Urgency::Overdue)
     }

@@ -89,7 +89,7 @@ fn nothing_waits_on_a_bus_that_cannot_keep_up_while_nothing_else_is_due() {
 }
 
 #[test]
-fn what_was_asked_in_vain_is_due_at_once_but_not_before_what_is_more_overdue() {
+fn what_was_asked_in_vain_is_due_at_once_but_behind_whatever_else_is_due() {
     let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
     run(&mut polls, Duration::from_millis(5), Time::from_millis(5_000));
     let now = Time::from_millis(5_300);
@@ -104,6 +104,19 @@ fn what_was_asked_in_vain_is_due_at_once_but_not_before_what_is_more_overdue() {
     })
     .collect();
     assert_eq!(order, [0, 1, 2]);
+    // That is also so for what has had more than its share of a bus that cannot keep up.
+    let mut ahead = self::polls(&[Poll::Fast, Poll::Fast]);
+    let mut behind = Pace { idle_at: None, stretch: 2.0 };
+    for at in [0, 100] {
+        ahead.begin(0, Time::from_millis(5_000 + at), &mut behind);
+    }
+    ahead.begin(1, Time::from_millis(5_100), &mut behind);
+    ahead.try_again(1, Time::from_millis(5_100), false);
+    assert_eq!(ahead.most_urgent(Time::from_millis(5_199)).map(|(index, _)| index), Some(1));
+    let Some((0, Urgency::Overdue(urgency))) = ahead.most_urgent(Time::from_millis(5_201)) else {
+        panic!("{:?}", ahead.most_urgent(Time::from_millis(5_201)));
+    };
+    assert!(urgency < 1.0, "{urgency}");
     // Unless somebody knows that it has to go first; and what has no period has nothing to be due by.
     polls.try_again(1, now, true);
     assert_eq!(polls.most_urgent(now), Some((1, Urgency::Wanted)));
