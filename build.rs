@@ -32,7 +32,7 @@ fn main() {
 /// Says for linkers which functions lie together, by the names that older compilers write.
 const SELDOM: &str = "scripts/seldom.ld";
 
-/// The script, each of its lines also for the names that newer compilers write (rustc from 1.96 to 1.99 on):
+/// The script, each of its lines also for the names that newer compilers write (rustc 1.99 does, 1.95 does not):
 /// `_ZN5hyper4body…` is `_RNvNtCs1Az9…_5hyper4body…` there, so from the crate on both are alike.
 fn with_newer_names(script: &str) -> String {
     let lines = script.lines().map(|line| {
