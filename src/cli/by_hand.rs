@@ -180,14 +180,15 @@ impl Asked {
             .map_err(|found| anyhow!("unit {unit} is no {}: {found}", device.profile).into())
     }
 
-    /// Takes every step of a command that has begun with `step`.
+    /// Takes every step of a command that begins with the question `first`.
     pub fn carry_out(
         &mut self,
         device: &Device,
         mut flow: CommandFlow,
-        mut step: Step,
+        first: Call,
         known: &[Option<i128>],
     ) -> Result<Outcome, Failure> {
+        let mut step = Step::Ask(first);
         loop {
             step = match step {
                 Step::Finished(outcome) => return Ok(outcome),

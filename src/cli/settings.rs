@@ -11,7 +11,7 @@ use super::by_hand::{Asked, ByHand};
 use super::output::{self, Table};
 use super::{Failure, configuration};
 use crate::engine::codec;
-use crate::engine::command::{CommandFlow, OutcomeKind, Step, words_of};
+use crate::engine::command::{CommandFlow, OutcomeKind, words_of};
 use crate::engine::configuration::load_wanted;
 use crate::engine::device::{Device, PointIndex};
 use crate::engine::memory::Memory;
@@ -222,9 +222,8 @@ fn write(
     while let Some((point, command)) = upkeep.next(|_| true) {
         let known = values.known().to_vec();
         let outcome = match CommandFlow::begin(device, point, &command, &known) {
-            (Some(flow), step) => asked.carry_out(device, flow, step, &known)?,
-            (None, Step::Finished(outcome)) => outcome,
-            (None, Step::Ask(_) | Step::AskLater(..) | Step::Settle(_)) => break,
+            Ok((flow, first)) => asked.carry_out(device, flow, first, &known)?,
+            Err(outcome) => outcome,
         };
         let is_last_word = upkeep.ended(Time::default(), point, &outcome);
         // What the write may have changed is read again before anything else is compared with it.

@@ -7,7 +7,7 @@ use super::read::as_text;
 use super::{Failure, output};
 use crate::engine::address::{Span, Table};
 use crate::engine::command::{
-    ACCEPTED, ACKNOWLEDGE, BUSY_MAX, CommandFlow, OutcomeKind, PAUSE_BUSY, Step, words_of,
+    ACCEPTED, ACKNOWLEDGE, BUSY_MAX, CommandFlow, OutcomeKind, PAUSE_BUSY, words_of,
 };
 use crate::engine::device::Order;
 use crate::engine::modbus::{Answer, Call, RequestError};
@@ -137,9 +137,8 @@ fn write_point(asked: &mut Asked, args: &Args) -> Result<(), Failure> {
     let mut known = vec![None; device.points.len()];
     asked.learn(&device, index, &mut known)?;
     let outcome = match CommandFlow::begin(&device, index, wanted, &known) {
-        (Some(flow), step) => asked.carry_out(&device, flow, step, &known)?,
-        (None, Step::Finished(outcome)) => return Err(Failure::wrong(outcome.reason.unwrap_or_default())),
-        (None, Step::Ask(_) | Step::AskLater(..) | Step::Settle(_)) => return Ok(()),
+        Ok((flow, first)) => asked.carry_out(&device, flow, first, &known)?,
+        Err(outcome) => return Err(Failure::wrong(outcome.reason.unwrap_or_default())),
     };
     let mut line = vec![args.place.clone(), outcome.kind.name().to_owned()];
     line.extend(outcome.found.map(|found| format!("the device holds {found}")));

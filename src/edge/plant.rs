@@ -7,15 +7,14 @@ use crate::edge::clock::Clock;
 use crate::edge::lock::lock;
 use crate::edge::mqtt::{BrokerState, Mailbox, News};
 use crate::edge::stir::Stir;
-use crate::engine::bus::{Command, Event, Full, REPLACED};
-use crate::engine::command::{Outcome, OutcomeKind, Wish};
+use crate::engine::bus::{Command, Event, Full, ended_at_once};
 use crate::engine::health::BrokerReport;
 use crate::engine::homeassistant;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::request::{Decision, Desk};
 use crate::engine::settings::Settings;
-use crate::engine::topics::{DeviceTopics, Message, Topics};
+use crate::engine::topics::Topics;
 
 /// The running parts.
 pub struct Plant {
@@ -26,7 +25,6 @@ pub struct Plant {
 
 struct Parts {
     settings: Arc<Settings>,
-    topics: Topics,
     mailbox: Arc<Mailbox>,
     desk: Desk,
     /// In the order of the settings.
@@ -45,7 +43,6 @@ impl Parts {
     fn new(settings: Settings, library: Library, stir: Arc<Stir>) -> Parts {
         Parts {
             desk: Desk::new(&settings, library),
-            topics: Topics::of(&settings.mqtt),
             mailbox: Arc::new(Mailbox::new(outbox(&settings), stir)),
             buses: Vec::new(),
             connection: None,
@@ -65,7 +62,6 @@ impl Plant {
     pub fn exchange(&self, settings: Settings, library: Library, buses: Vec<Arc<BusHandle>>) {
         let mut parts = self.parts();
         parts.desk = Desk::new(&settings, library);
-        parts.topics = Topics::of(&settings.mqtt);
         parts.settings = Arc::new(settings);
         parts.buses = buses;
     }
@@ -119,7 +115,10 @@ impl Plant {
             News::Down => parts.tell_all(&Event::BrokerDown),
             News::Get { device, point } => {
                 // Who finds no room reads at the next poll.
-                let _ = parts.tell_bus_of(&device.clone(), Event::Get { device, point });
+                match parts.desk.bus_of(&device) {
+                    Some(bus) => drop(parts.hand_over(bus, Event::Get { device, point })),
+                    None => tracing::debug!("a message for `{device}`, which is no device of this gateway"),
+                }
             }
             News::Request { verb, payload, retained, stale } => {
                 let decision = match stale {
@@ -137,36 +136,23 @@ impl Plant {
 
 impl Parts {
     fn command(&self, command: Command) {
-        let device = command.device.clone();
-        if let Some(outcome) = self.desk.refusal_of_set(&device, &command.payload) {
-            // What is retained is nobody's wish of now.
-            if !command.retained {
-                self.tell_outcome(&device, &command.point, &outcome);
+        let Command { device, point, payload, retained } = &command;
+        match self.desk.bus_of_set(device, point, payload, *retained) {
+            Ok(bus) => {
+                let taken = self.hand_over(bus, Event::Command(command.clone()));
+                if let Some(outcome) = ended_at_once(&command, &taken) {
+                    self.mailbox.push(self.desk.outcome(device, point, &outcome));
+                }
             }
-            return;
+            Err(decision) => self.carry_out(decision),
         }
-        let (command, kind, reason) = match self.tell_bus_of(&device, Event::Command(command.clone())) {
-            Ok(None) => return,
-            Ok(Some(older)) => (older, OutcomeKind::Expired, REPLACED),
-            Err(Full) => (command, OutcomeKind::Refused, "too many commands of this bus wait already"),
-        };
-        self.tell_outcome(&device, &command.point, &Wish::parse(&command.payload).ended(kind, reason));
-    }
-
-    fn tell_outcome(&self, device: &str, point: &str, outcome: &Outcome) {
-        let topic = self.topics_of(device).outcome(point);
-        self.mailbox.push(Message::once(topic, outcome.to_json()));
     }
 
     fn carry_out(&self, decision: Decision) {
         match decision {
             Decision::Ask(bus, request) => {
-                let taken = self.buses.get(bus).is_some_and(|bus| {
-                    let event = Event::Request(request.clone());
-                    bus.send(event).is_ok()
-                });
-                if !taken {
-                    self.mailbox.push(request.refusal(&self.topics, "too much waits for the bus"));
+                if self.hand_over(bus, Event::Request(request.clone())).is_err() {
+                    self.mailbox.push(self.desk.no_room(&request));
                 }
             }
             Decision::Answer(message) => self.mailbox.push(message),
@@ -184,19 +170,8 @@ impl Parts {
         }
     }
 
-    fn topics_of(&self, device: &str) -> DeviceTopics {
-        let bus = self.desk.bus_of(device).and_then(|bus| self.settings.buses.get(bus));
-        self.topics.of_device(bus.map_or("", |bus| &bus.name), device)
-    }
-
-    /// Returns the command whose place the event took.
-    fn tell_bus_of(&self, device: &str, event: Event) -> Result<Option<Command>, Full> {
-        match self.desk.bus_of(device).map(|bus| self.buses.get(bus)) {
-            Some(bus) => bus.map_or(Err(Full), |bus| bus.send(event)),
-            None => {
-                tracing::debug!("a message for `{device}`, which is no device of this gateway");
-                Ok(None)
-            }
-        }
+    /// To the bus of this number. Returns the command whose place the event took.
+    fn hand_over(&self, bus: usize, event: Event) -> Result<Option<Command>, Full> {
+        self.buses.get(bus).map_or(Err(Full), |bus| bus.send(event))
     }
 }

@@ -35,14 +35,10 @@ impl App {
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
         let old = self.plant.settings();
         let mut change = reload::compare(&old, &settings);
-        // The same port can be taken only when it has been left.
-        let port = self.http_address().map(|address| format!(":{}", address.port()));
-        let is_its_own = |listen: &String| port.as_ref().is_some_and(|port| listen.ends_with(port));
-        let moves =
-            old.http.listen != settings.http.listen && !settings.http.listen.as_ref().is_some_and(is_its_own);
-        let listener = match &settings.http.listen {
-            Some(listen) if moves => Some(self.runtime.block_on(Http::bind(listen))?),
-            Some(_) | None => None,
+        let port = self.http_address().map(|address| address.port());
+        let listener = match reload::listens_before_leaving(&old, &settings, port) {
+            Some(listen) => Some(self.runtime.block_on(Http::bind(listen))?),
+            None => None,
         };
         let names = || settings.devices.iter().map(|device| device.name.as_str());
         let state = match old.state_dir == settings.state_dir {
@@ -53,7 +49,7 @@ impl App {
         if state.as_ref().is_some_and(|state| !is_kept(state) || !is_kept(&self.state.now())) {
             change.every_device_begins_anew(&old, &settings);
         }
-        let http_ends = old.http != settings.http || keys.token != self.keys.token;
+        let http_ends = change.http || keys.token != self.keys.token;
         let listen = settings.http.listen.clone();
         if change.is_nothing() && keys == self.keys {
             tracing::info!("the new configuration changes nothing that runs");
@@ -89,14 +85,10 @@ impl App {
     ) -> anyhow::Result<()> {
         let before = old.buses.iter().map(|bus| bus.name.clone()).zip(self.plant.buses());
         let mut running: BTreeMap<String, Arc<BusHandle>> = before.collect();
-        let stays = |name: &str| {
-            let mut fates = change.buses.iter();
-            fates.any(|(bus, fate)| bus == name && matches!(fate, Fate::Stays { .. }))
-        };
         let _change = Reporter::change(&self.reporter);
         // Nobody asks a bus that is about to end, and takes its silence for a fault.
-        self.reporter.keep(stays);
-        let ending: Vec<String> = running.keys().filter(|name| !stays(name)).cloned().collect();
+        self.reporter.keep(|bus| change.stays(bus));
+        let ending: Vec<String> = running.keys().filter(|name| !change.stays(name)).cloned().collect();
         let ended = ending.iter().filter_map(|name| running.remove(name)).collect();
         end_buses(&self.runtime, ended);
         for (name, fate) in &change.buses {
@@ -160,13 +152,7 @@ impl App {
         if change.telling != Telling::AsBefore || change.memory {
             self.look_anew();
         }
-        if change.rules.is_some() {
-            tracing::info!("what holds for every bus has changed, and the buses go on");
-        }
-        for (name, fate) in &change.buses {
-            tell_fate(name, fate);
-        }
-        change.ended.iter().for_each(|name| tracing::info!("bus {name}: gone"));
+        change.lines().iter().for_each(|line| tracing::info!("{line}"));
         Ok(())
     }
 
@@ -304,21 +290,4 @@ impl App {
 
 fn on_bus(devices: &[DeviceSettings], bus: usize) -> Vec<DeviceSettings> {
     devices.iter().map(|device| DeviceSettings { bus, ..device.clone() }).collect()
-}
-
-fn tell_fate(name: &str, fate: &Fate) {
-    match fate {
-        Fate::Stays { leave, come } => {
-            let come: Vec<&str> = come.iter().map(|device| device.name.as_str()).collect();
-            for device in leave.iter().filter(|device| !come.contains(&device.as_str())) {
-                tracing::info!("bus {name}: {device} is gone");
-            }
-            for device in come {
-                let changed = if leave.iter().any(|other| other == device) { "changed" } else { "new" };
-                tracing::info!("bus {name}: {device} is {changed}");
-            }
-        }
-        Fate::Restarts => tracing::info!("bus {name}: changed, and started anew"),
-        Fate::Begins => tracing::info!("bus {name}: new"),
-    }
 }

@@ -157,39 +157,30 @@ impl Outcome {
 }
 
 impl CommandFlow {
-    /// Checks the wish and takes the first step; `known` as in [`codec::resolve`]. The caller has made
-    /// sure that what decides the point's meaning is known.
+    /// Checks the wish; returns the command and its first question, or how it has ended already. `known` as in
+    /// [`codec::resolve`]: the caller has made sure that what decides the point's meaning is known.
     pub fn begin(
         device: &Device,
         point: PointIndex,
         wanted: &str,
         known: &[Option<i128>],
-    ) -> (Option<CommandFlow>, Step) {
+    ) -> Result<(CommandFlow, Call), Outcome> {
         let details = &device.points[point];
-        let refuse =
-            |reason: String| (None, Step::Finished(Outcome::new(OutcomeKind::Refused, wanted, reason)));
-        let Some(write) = &details.write else {
-            return refuse(format!("`{}` is read-only", details.name));
-        };
-        let codec::Obeyed { words: field, note } = match codec::resolve(device, point, known) {
-            Ok(resolved) => match codec::obey(details, write, &resolved, wanted) {
-                Ok(obeyed) => obeyed,
-                Err(reason) => return refuse(reason),
-            },
-            Err(missing) => return refuse(missing.to_string()),
-        };
-        let flow = |state, call: &Call| {
-            let (wanted, note, asked) = (wanted.to_string(), note.clone(), Some(call.clone()));
-            CommandFlow { point, wanted, note, state, asked, busy: 0 }
-        };
+        let refused = |reason: String| Outcome::new(OutcomeKind::Refused, wanted, reason);
+        let write = details.write.as_ref();
+        let write = write.ok_or_else(|| refused(format!("`{}` is read-only", details.name)))?;
+        let resolved =
+            codec::resolve(device, point, known).map_err(|missing| refused(missing.to_string()))?;
+        let codec::Obeyed { words: field, note } =
+            codec::obey(details, write, &resolved, wanted).map_err(refused)?;
         let compares = details.persistent && !is_press(write);
         let reads_before = compares || write.at.bits.is_some() || write.on_change.is_some();
-        if !reads_before {
-            let call = write_call(write, &field);
-            return (Some(flow(State::Writing { field }, &call)), Step::Ask(call));
-        }
-        let call = Call::Read(write.at.span);
-        (Some(flow(State::ReadingBefore { field }, &call)), Step::Ask(call))
+        let (call, state) = match reads_before {
+            true => (Call::Read(write.at.span), State::ReadingBefore { field }),
+            false => (write_call(write, &field), State::Writing { field }),
+        };
+        let (wanted, asked) = (wanted.to_string(), Some(call.clone()));
+        Ok((CommandFlow { point, wanted, note, state, asked, busy: 0 }, call))
     }
 
     pub fn point(&self) -> PointIndex {

@@ -1,16 +1,16 @@
 //! What a bus and its devices say of themselves: counters, states and reasons.
 
+mod broker;
 mod bulletin;
 mod json;
 mod readout;
 mod spread;
 
+pub use broker::BrokerReport;
 pub use bulletin::{Bulletin, info};
 pub use json::{device_json, drift_json, point_json, seconds};
 pub use readout::{Readout, ReadoutValue};
 pub use spread::{Percentiles, Spread, SpreadReport, Timing, TimingReport};
-
-use std::collections::BTreeMap;
 
 use crate::engine::device::{Category, Point, Poll};
 use crate::engine::modbus::{Discarded, RequestError};
@@ -323,37 +323,6 @@ pub struct GatewayReport {
     pub buses: Vec<BusHealth>,
     /// Why the newest configuration is not the one that runs.
     pub configuration_error: Option<String>,
-}
-
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct BrokerReport {
-    pub connected: bool,
-    /// Why not.
-    pub reason: Option<String>,
-    /// How often the connection was made since the start.
-    pub connects: u64,
-    /// Another client with the same identifier takes this gateway's place again and again.
-    pub client_id_taken: bool,
-    /// Others tell something else of this gateway's state, again and again.
-    pub state_denied: bool,
-    /// Topics of which the broker is not told what stands there, since it takes no message as long.
-    pub kept_back: Vec<String>,
-    /// Topics of which the broker does not hand on what is told there, although it confirms it.
-    pub not_arriving: Vec<String>,
-    /// Where other gateways announce what has the identity of something of ours: by discovery topic, their base
-    /// topics.
-    pub announced_by_others: BTreeMap<String, String>,
-    /// Messages that wait for it: at most one for each retained topic, and those told once.
-    pub waiting: usize,
-    /// Messages told once that were dropped since too many waited.
-    pub dropped: u64,
-}
-
-impl BrokerReport {
-    /// Whether the broker does not hand on all that this gateway has to tell.
-    pub fn misses_something(&self) -> bool {
-        !(self.kept_back.is_empty() && self.not_arriving.is_empty() && self.announced_by_others.is_empty())
-    }
 }
 
 #[derive(Clone, Debug, PartialEq)]

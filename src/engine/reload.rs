@@ -56,6 +56,20 @@ impl Change {
         }
     }
 
+    /// Whether the bus of this name goes on.
+    pub fn stays(&self, bus: &str) -> bool {
+        self.buses.iter().any(|(name, fate)| name == bus && matches!(fate, Fate::Stays { .. }))
+    }
+
+    /// What people are told when it has been done.
+    pub fn lines(&self) -> Vec<String> {
+        let rules =
+            self.rules.map(|_| "what holds for every bus has changed, and the buses go on".to_string());
+        let of_buses = self.buses.iter().flat_map(|(bus, fate)| fate.lines(bus));
+        let ended = self.ended.iter().map(|bus| format!("bus {bus}: gone"));
+        rules.into_iter().chain(of_buses).chain(ended).collect()
+    }
+
     pub fn is_nothing(&self) -> bool {
         let stays = |(_, fate): &(String, Fate)| matches!(fate, Fate::Stays { leave, come } if leave.is_empty() && come.is_empty());
         !self.broker
@@ -66,6 +80,30 @@ impl Change {
             && self.ended.is_empty()
             && self.buses.iter().all(stays)
     }
+}
+
+impl Fate {
+    fn lines(&self, bus: &str) -> Vec<String> {
+        let (leave, come) = match self {
+            Fate::Stays { leave, come } => (leave, come),
+            Fate::Restarts => return vec![format!("bus {bus}: changed, and started anew")],
+            Fate::Begins => return vec![format!("bus {bus}: new")],
+        };
+        let gone = leave.iter().filter(|name| !come.iter().any(|device| device.name == **name));
+        let gone = gone.map(|name| format!("bus {bus}: {name} is gone"));
+        let here = come.iter().map(|DeviceSettings { name, .. }| {
+            format!("bus {bus}: {name} is {}", if leave.contains(name) { "changed" } else { "new" })
+        });
+        gone.chain(here).collect()
+    }
+}
+
+/// Where HTTP is to be listened to before the old address is left, so that nothing has changed if that cannot be. The
+/// same port, `port` of the old address, can be taken only when it has been left.
+pub fn listens_before_leaving<'n>(old: &Settings, new: &'n Settings, port: Option<u16>) -> Option<&'n str> {
+    let listen = new.http.listen.as_deref().filter(|_| old.http.listen != new.http.listen)?;
+    let is_the_same = port.is_some_and(|port| listen.ends_with(&format!(":{port}")));
+    (!is_the_same).then_some(listen)
 }
 
 /// Compares two configurations.
@@ -235,5 +273,45 @@ devices:
             check(&[("\nmqtt:", &format!("\nhome_assistant: {{{section}}}\nmqtt:"))], "told otherwise");
         }
         check(&[("\nmqtt:", "\nstate_dir: /tmp\nmqtt:")], "memory");
+    }
+
+    #[test]
+    fn people_are_told_what_became_of_each_bus_and_device() {
+        let after = "
+eeprom: {daily: 7}
+buses: {a: {tcp: 'host:502'}, c: {tcp: 'host:504'}}
+devices:
+  one: {bus: a, unit: 9, points: {x: {at: input 0, poll: fast}}}
+  four: {bus: a, unit: 4, points: {x: {at: input 0, poll: fast}}}
+";
+        let change = compare(&settings(BEFORE), &settings(after));
+        let expected = [
+            "what holds for every bus has changed, and the buses go on",
+            "bus a: two is gone",
+            "bus a: one is changed",
+            "bus a: four is new",
+            "bus c: new",
+            "bus b: gone",
+        ];
+        assert_eq!(change.lines(), expected);
+        assert_eq!(["a", "b", "c"].map(|bus| change.stays(bus)), [true, false, false]);
+    }
+
+    #[test]
+    fn another_port_is_listened_to_before_the_old_one_is_left() {
+        let with = |listen: &str| settings(&format!("http: {{listen: {listen}}}{BEFORE}"));
+        for (old, port, new, expected) in [
+            ("'h:80'", Some(80), "'h:81'", Some("h:81")),
+            ("null", None, "'h:80'", Some("h:80")),
+            ("'h:80'", Some(80), "'h:80'", None),
+            ("'h:80'", Some(80), "'other:80'", None),
+            ("'h:80'", Some(80), "'h:8080'", Some("h:8080")),
+            ("'h:80'", Some(80), "null", None),
+            // The port of the old one was for the system to choose.
+            ("'h:0'", Some(4711), "'h:4711'", None),
+        ] {
+            let new = with(new);
+            assert_eq!(listens_before_leaving(&with(old), &new, port), expected, "{old}, {:?}", new.http);
+        }
     }
 }

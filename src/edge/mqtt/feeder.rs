@@ -37,8 +37,6 @@ pub(super) struct Feeder<Tell> {
     pub state: Arc<Mutex<BrokerReport>>,
     pub connection: Arc<Mutex<Connection>>,
     pub connected: bool,
-    /// Whether the last connection was lost to somebody else with our identifier.
-    pub contested: bool,
     /// What was last told of the connection.
     pub told_up: Option<bool>,
     /// What is still to be subscribed to.
@@ -50,8 +48,6 @@ pub(super) struct Feeder<Tell> {
     /// What is still to be let go of.
     pub unwanted: Vec<String>,
     pub ending: bool,
-    /// Whether it was told that others tell something else of this gateway's state.
-    pub denied: bool,
 }
 
 impl<Tell: Fn(News)> Feeder<Tell> {
@@ -107,11 +103,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
         match seen {
             Seen::Up => {
                 tracing::info!("connected to the broker");
-                let mut state = lock(&self.state);
-                state.connected = true;
-                state.reason = None;
-                state.connects += 1;
-                drop(state);
+                lock(&self.state).made();
                 self.connected = true;
                 (self.wanted, self.unwanted) = (self.courier.begin_anew(), Vec::new());
                 self.mailbox.outbox().connected();
@@ -119,17 +111,9 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.courier.tell(News::Up);
             }
             Seen::Down { reason, contested, suspect } => {
-                let mut state = lock(&self.state);
-                state.connected = false;
-                // Once for each reason, not once for each attempt; and a quarrel once, not each time
-                // that it is lost.
-                let is_known = state.reason.as_ref() == Some(&reason) || (contested && self.contested);
-                if !is_known {
+                if lock(&self.state).lost(reason.clone(), contested) {
                     tracing::warn!("{reason}");
                 }
-                self.contested = contested;
-                state.reason = Some(reason);
-                drop(state);
                 (self.connected, self.awaits_answer) = (false, None);
                 self.mailbox.outbox().disconnected();
                 self.judge_length(suspect);
@@ -241,11 +225,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
     }
 
     fn heard_state(&mut self, payload: &str) {
-        let now = self.clock.now();
-        let mut outbox = self.mailbox.outbox();
-        outbox.heard_state(payload, now);
-        let is_denied = outbox.is_denied(now);
-        if is_denied && !self.denied {
+        if self.mailbox.outbox().heard_state(payload, self.clock.now()) {
             tracing::warn!(
                 "somebody else tells `{}` on `{}` again and again, and is put right some times a minute: has another \
                  gateway `base_topic: {}`?",
@@ -254,7 +234,6 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 self.topics.base()
             );
         }
-        self.denied = is_denied;
     }
 
     /// When the broker is asked next whether it is there.

@@ -121,14 +121,12 @@ impl Broker {
             state: state.clone(),
             connection: connection.clone(),
             connected: false,
-            contested: false,
             told_up: None,
             wanted: Vec::new(),
             asked_for: Vec::new(),
             awaits_answer: None,
             unwanted: Vec::new(),
             ending: false,
-            denied: false,
         };
         let feeder = tokio::spawn(async move {
             feeder.run(events, orders_heard).await;

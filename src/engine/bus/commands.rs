@@ -299,15 +299,15 @@ impl Bus {
         let Some((point, value)) = orders.pop_front() else { return };
         let state = &self.devices[device];
         match CommandFlow::begin(state.device(), point, &value, state.known()) {
-            (Some(flow), step) => {
-                self.take_step(Active { device, target, wanted, came_at, flow, orders }, step);
+            Ok((flow, call)) => {
+                let active = Active { device, target, wanted, came_at, flow, orders };
+                self.take_step(active, Step::Ask(call));
             }
-            (None, Step::Finished(outcome)) => {
+            Err(outcome) => {
                 self.setting_ended(device, target, &outcome);
                 self.devices[device].command_ended(self.now, point, &outcome, &mut self.context);
                 self.tell_outcome(device, target, wanted.of(outcome));
             }
-            (None, Step::Ask(_) | Step::AskLater(..) | Step::Settle(_)) => {}
         }
     }
 

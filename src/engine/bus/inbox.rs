@@ -2,7 +2,9 @@
 
 use std::collections::VecDeque;
 
+use super::waiting::REPLACED;
 use super::{Command, Event};
+use crate::engine::command::{Outcome, OutcomeKind, Wish};
 
 /// Events that wait until the bus takes them.
 #[derive(Debug, Default)]
@@ -14,6 +16,16 @@ pub struct Inbox {
 /// There is no room, or nobody takes anything any more.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Full;
+
+/// How a command has ended by being handed to its bus, or the one for the same point whose place it took.
+pub fn ended_at_once(command: &Command, taken: &Result<Option<Command>, Full>) -> Option<Outcome> {
+    let (ended, kind, reason) = match taken {
+        Ok(None) => return None,
+        Ok(Some(older)) => (older, OutcomeKind::Expired, REPLACED),
+        Err(Full) => (command, OutcomeKind::Refused, "too many commands of this bus wait already"),
+    };
+    Some(Wish::parse(&ended.payload).ended(kind, reason))
+}
 
 impl Inbox {
     /// The bus takes all of them between two looks at the line, so this fills only when something floods it.
@@ -92,6 +104,22 @@ mod tests {
         assert_eq!(waiting.len() + replaced.len(), 1001);
         assert_eq!(waiting[Inbox::LIMIT - 1].payload, "999", "it is taken last");
         assert!(replaced.iter().all(|command| command.payload != "999"));
+    }
+
+    #[test]
+    fn a_command_without_room_is_refused_and_one_whose_place_is_taken_has_expired() {
+        let [older, newer] = [7, 8].map(|value| match set("output_1", value) {
+            Event::Command(command) => command,
+            other => panic!("{other:?}"),
+        });
+        let told = |taken| {
+            let outcome = ended_at_once(&newer, &taken)?;
+            Some((outcome.kind, outcome.wanted, outcome.reason.unwrap_or_default()))
+        };
+        assert_eq!(told(Ok(None)), None);
+        assert_eq!(told(Ok(Some(older))), Some((OutcomeKind::Expired, "7".into(), REPLACED.into())));
+        let full = "too many commands of this bus wait already".to_string();
+        assert_eq!(told(Err(Full)), Some((OutcomeKind::Refused, "8".into(), full)));
     }
 
     #[test]

@@ -44,12 +44,11 @@ pub use context::Telling;
 use device::{DeviceState, Turn};
 use devices::Devices;
 use fetch::Fetch;
-pub use inbox::{Full, Inbox};
+pub use inbox::{Full, Inbox, ended_at_once};
 use recording::Recorder;
 pub use recording::Saved;
 use requests::Requests;
 use timekeeping::Timekeeping;
-pub use waiting::REPLACED;
 use waiting::{Target, WaitingCommands};
 
 /// What can happen to a bus.

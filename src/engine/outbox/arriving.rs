@@ -153,7 +153,7 @@ mod tests {
 
     fn comes_back(outbox: &mut Outbox, topic: &str, now: Time) {
         match topic {
-            STATE => outbox.heard_state("online", now),
+            STATE => assert!(!outbox.heard_state("online", now), "nobody denies it"),
             BRIDGE => outbox.heard_announcement(topic, SHORT, now),
             _ => outbox.heard_announcement(topic, &"b".repeat(2000), now),
         }

@@ -17,6 +17,8 @@ pub(super) struct Claim {
     corrected: VecDeque<Time>,
     /// It is to be put right then.
     due: Option<Time>,
+    /// Whether others denied it again and again when something was heard of it last.
+    was_denied: bool,
 }
 
 impl Claim {
@@ -56,16 +58,21 @@ impl Claim {
 
 impl Outbox {
     /// Somebody has told the gateway's state, itself perhaps. What is not so is put right. Not to be told what the
-    /// broker kept from before this connection, since the state follows then anyway.
-    pub fn heard_state(&mut self, payload: &str, now: Time) {
+    /// broker kept from before this connection, since the state follows then anyway. Whether a quarrel about it has
+    /// begun by that: people should know, once.
+    pub fn heard_state(&mut self, payload: &str, now: Time) -> bool {
         let topic = self.topics.bridge_state();
-        let Some(entry) = self.retained.get(&*topic) else { return };
-        if *entry.payload == *payload {
-            self.claim.due = None;
-            self.has_arrived(&topic, payload.len(), now);
-        } else if !entry.queued && self.claim.denied(now) {
-            self.tell_state_again();
+        if let Some(entry) = self.retained.get(&*topic) {
+            if *entry.payload == *payload {
+                self.claim.due = None;
+                self.has_arrived(&topic, payload.len(), now);
+            } else if !entry.queued && self.claim.denied(now) {
+                self.tell_state_again();
+            }
         }
+        let is_denied = self.is_denied(now);
+        let was_denied = std::mem::replace(&mut self.claim.was_denied, is_denied);
+        is_denied && !was_denied
     }
 
     /// Whether others tell something else of this gateway's state again and again.
@@ -122,16 +129,17 @@ mod tests {
         let mut outbox = outbox();
         outbox.connected();
         take_all(&mut outbox);
-        let mut told = 0;
+        let (mut told, mut quarrels) = (0, 0);
         for second in 0..600 {
             let now = at(second * 1000);
             outbox.wake(now);
-            outbox.heard_state("offline", now);
+            quarrels += usize::from(outbox.heard_state("offline", now));
             told += take_all(&mut outbox).len();
-            outbox.heard_state("online", now);
+            quarrels += usize::from(outbox.heard_state("online", now));
             assert_eq!(outbox.is_denied(now), told >= CORRECTIONS, "after {second} s");
         }
         assert!((50..=CORRECTIONS * 11).contains(&told), "{told} times in ten minutes");
+        assert_eq!(quarrels, 1, "it is one all the time");
         // The last word is ours, also when the other one has had one just after ours.
         outbox.heard_state("offline", at(599_500));
         let due = outbox.wake_at().expect("it is put right later");
@@ -139,5 +147,13 @@ mod tests {
         check_sent(&mut outbox, &[STATE]);
         assert!(!outbox.is_denied(due + WITHIN));
         assert_eq!(outbox.wake_at(), None);
+        // The next quarrel is another.
+        let later = due + WITHIN + WITHIN;
+        let mut begins = || {
+            let begins = outbox.heard_state("offline", later);
+            take_all(&mut outbox);
+            begins
+        };
+        assert_eq!((0..20).filter(|_| begins()).count(), 1);
     }
 }

@@ -18,7 +18,7 @@ use crate::engine::yaml::{Scalar, list_of_choices};
 /// A bus that was forgotten in its pause comes back after this.
 const PAUSE_LONGEST: Duration = Duration::from_secs(3600);
 
-/// What is to be done with a request.
+/// What is to be done with a request, or with a command that is for no bus.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Decision {
     /// It is for the bus of this number.
@@ -99,13 +99,33 @@ impl Desk {
         self.bus_of.get(device).copied()
     }
 
-    /// The outcome of a message on a `set` topic that is for no bus: of no device, or too long to be a value.
-    pub fn refusal_of_set(&self, device: &str, wanted: &str) -> Option<Outcome> {
-        if !self.bus_of.contains_key(device) {
-            let reason = self.no_device(device);
-            return Some(command::Wish::parse(wanted).ended(OutcomeKind::Refused, reason));
-        }
-        Outcome::of_too_long(wanted)
+    /// The number of the bus that a message on a `set` topic is for. If it is for none, of no device or too long to be
+    /// a value: what is to be done with it. What is retained is nobody's wish of now.
+    pub fn bus_of_set(
+        &self,
+        device: &str,
+        point: &str,
+        wanted: &str,
+        retained: bool,
+    ) -> Result<usize, Decision> {
+        let outcome = match (self.bus_of(device), Outcome::of_too_long(wanted)) {
+            (Some(bus), None) => return Ok(bus),
+            (Some(_), Some(too_long)) => too_long,
+            (None, _) => command::Wish::parse(wanted).ended(OutcomeKind::Refused, self.no_device(device)),
+        };
+        Err(if retained { Decision::Ignore } else { Decision::Answer(self.outcome(device, point, &outcome)) })
+    }
+
+    /// How a command has ended, for whoever gave it.
+    pub fn outcome(&self, device: &str, point: &str, outcome: &Outcome) -> Message {
+        let bus = self.bus_of(device).and_then(|bus| self.buses.get(bus));
+        let own = self.topics.of_device(bus.map_or("", |(name, _)| name), device);
+        Message::once(own.outcome(point), outcome.to_json())
+    }
+
+    /// The answer to a request for a bus that has no room for it.
+    pub fn no_room(&self, request: &Request) -> Message {
+        request.refusal(&self.topics, "too much waits for the bus")
     }
 
     fn no_device(&self, name: &str) -> String {
@@ -267,12 +287,18 @@ devices:
     #[test]
     fn a_command_for_no_device_is_refused_and_so_is_a_book() {
         let desk = desk();
-        let reason = |device: &str, wanted: &str| desk.refusal_of_set(device, wanted)?.reason;
-        assert_eq!(reason("relays", "ON"), None);
-        let meant = "there is no device `relay`; did you mean `relays`?";
-        assert_eq!(reason("relay", "ON").as_deref(), Some(meant));
-        let long = "5000 bytes are no value; expected at most 1024";
-        assert_eq!(reason("relays", &"7".repeat(5000)).as_deref(), Some(long));
+        assert_eq!(desk.bus_of_set("relays", "output_1", "ON", false), Ok(0));
+        for (device, wanted, expected) in [
+            ("relay", "ON", "there is no device `relay`; did you mean `relays`?"),
+            ("relays", &"7".repeat(5000), "5000 bytes are no value; expected at most 1024"),
+        ] {
+            let Err(Decision::Answer(message)) = desk.bus_of_set(device, "output_1", wanted, false) else {
+                panic!("`{device}` is a device")
+            };
+            assert_eq!(message.topic, format!("busker/{device}/output_1/outcome"));
+            assert!(message.payload.contains("refused") && message.payload.contains(expected), "{message:?}");
+            assert_eq!(desk.bus_of_set(device, "output_1", wanted, true), Err(Decision::Ignore));
+        }
     }
 
     #[test]

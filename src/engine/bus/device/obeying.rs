@@ -1,7 +1,7 @@
 //! What a device does with commands: which it can take, what is asked for them, and what follows.
 
 use crate::engine::codec;
-use crate::engine::command::{CommandFlow, Outcome, OutcomeKind, Step};
+use crate::engine::command::{CommandFlow, Outcome, OutcomeKind};
 use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::plan::Read;
@@ -217,10 +217,8 @@ impl DeviceState {
         if !self.is_present() || !self.details(point).selectors().is_empty() {
             return None;
         }
-        match CommandFlow::begin(self.device(), point, wanted, self.known()) {
-            (None, Step::Finished(outcome)) => Some((point, outcome)),
-            _ => None,
-        }
+        let outcome = CommandFlow::begin(self.device(), point, wanted, self.known()).err()?;
+        Some((point, outcome))
     }
 
     /// The connection is new: the broker tells again which retained commands it holds.
