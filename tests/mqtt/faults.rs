@@ -480,7 +480,7 @@ impl Stage {
             Meanwhile::ObeyedAtOnce => ("ON", 2),
             _ => ("OFF", 1),
         };
-        assert_eq!(relay(&self.simulation, 1), obeyed);
+        assert_eq!(relay(&self.simulation, 1), obeyed, "its outcomes are {:?}", self.outcomes(1));
         let (_, metrics) = self.gateway.get("/metrics");
         let writes = "busker_device_writes_total{bus=\"line\",device=\"relays\"} ";
         let writes = metrics.lines().find_map(|line| line.strip_prefix(writes)).expect("writes are counted");

@@ -68,7 +68,7 @@ impl Broker {
 
     /// It runs no longer and has not ended, like a machine that swaps.
     pub fn stall(&self) {
-        self.signal(Signal::STOP);
+        super::stall(self.child.as_ref().expect("it runs"));
     }
 
     /// The end of [`Broker::stall`].

@@ -207,7 +207,7 @@ impl Gateway {
 
     /// It runs no longer and has not ended.
     pub fn stall(&self) {
-        self.signal(Signal::STOP);
+        super::stall(&self.child);
     }
 
     /// The end of [`Gateway::stall`].

@@ -17,6 +17,7 @@ use std::time::Duration;
 use busker::edge::clock::Clock;
 use busker::edge::lock::lock;
 use busker::engine::time::Time;
+use rustix::process::{Pid, Signal, WaitOptions, kill_process, waitpid};
 use tempfile::TempDir;
 
 pub use broker::Broker;
@@ -65,6 +66,15 @@ pub fn temporary_file(folder: &TempDir, name: &str, text: &str) -> PathBuf {
 fn end(child: &mut Child) {
     let _ = child.kill();
     let _ = child.wait();
+}
+
+/// Stops a program, and waits until it stands: its other threads run on until one of them has had the signal, and
+/// would do what it is asked meanwhile.
+fn stall(child: &Child) {
+    let pid = Pid::from_child(child);
+    kill_process(pid, Signal::STOP).expect("the signal is sent");
+    let stands = waitpid(Some(pid), WaitOptions::UNTRACED).expect("it is ours");
+    assert!(stands.is_some_and(|(_, status)| status.stopped()), "it has ended instead: {stands:?}");
 }
 
 /// What a thread collects for a test that waits for it.

@@ -1,6 +1,7 @@
 //! Somebody who watches topics, mostly all, and remembers in which order what came.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use busker::edge::clock::Clock;
@@ -23,6 +24,8 @@ pub struct Received {
 pub struct Watcher {
     client: Client,
     received: Arc<Collected<Received>>,
+    /// Nobody watches any more.
+    ended: Arc<AtomicBool>,
 }
 
 impl Watcher {
@@ -48,7 +51,9 @@ impl Watcher {
         connection.eventloop.set_network_options(network);
         let received = Arc::<Collected<Received>>::default();
         let (subscribed, is_subscribed) = std::sync::mpsc::channel();
+        let ended = Arc::<AtomicBool>::default();
         let (own_client, own_received, clock) = (client.clone(), received.clone(), Clock::start());
+        let own_ended = ended.clone();
         let topics = topics.to_owned();
         std::thread::spawn(move || {
             for event in connection.iter() {
@@ -67,13 +72,16 @@ impl Watcher {
                     }
                     Ok(Event::Outgoing(rumqttc::Outgoing::Disconnect)) => return,
                     Ok(_) => {}
+                    // With the connection the library forgets that it was asked to disconnect. It would come back
+                    // for ever, and take the place of whoever watches under its name by now.
+                    Err(_) if own_ended.load(Ordering::SeqCst) => return,
                     // The broker is away; it comes back, or the test ends.
                     Err(_) => std::thread::sleep(Duration::from_millis(50)),
                 }
             }
         });
         is_subscribed.recv_timeout(PATIENCE).expect("the broker takes the subscription");
-        Watcher { client, received }
+        Watcher { client, received, ended }
     }
 
     /// Publishes without retaining.
@@ -158,6 +166,8 @@ impl Watcher {
 
 impl Drop for Watcher {
     fn drop(&mut self) {
+        // Before it can be forgotten.
+        self.ended.store(true, Ordering::SeqCst);
         // The broker may be gone.
         let _ = self.client.try_disconnect();
     }
