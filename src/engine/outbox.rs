@@ -435,6 +435,11 @@ impl Outbox {
         topics.into_iter().map(|(.., topic)| topic.clone()).collect()
     }
 
+    /// Where what has this identity is announced.
+    fn discovery(&self, identity: &str) -> String {
+        topics::discovery(self.discovery_prefix.trim_end_matches("/device/"), identity)
+    }
+
     fn rank(&self, topic: &str) -> Rank {
         if topic.starts_with(&self.discovery_prefix) {
             return Rank::Discovery;

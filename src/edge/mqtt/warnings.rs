@@ -1,4 +1,5 @@
-//! What the log says of a broker that does not hand on what it was told.
+//! What the log says of what the outbox has noticed: another gateway in this one's place, and what the broker does not
+//! hand on.
 
 use crate::engine::outbox::{NotArriving, Outbox, RivalNews};
 use crate::engine::topics::Topics;

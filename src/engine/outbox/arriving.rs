@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::Outbox;
 use crate::engine::time::{Duration, Time};
-use crate::engine::topics::{self, Message};
+use crate::engine::topics::Message;
 
 /// When nothing has come back for so long, what is still awaited will not come.
 const COMES_BACK_WITHIN: Duration = Duration::from_secs(20);
@@ -62,8 +62,7 @@ impl Outbox {
     /// The broker does not let this gateway listen to what these filters name: what is told there does not come
     /// back, and may have arrived all the same.
     pub fn cannot_hear(&mut self, filters: &[&str]) {
-        let prefix = self.discovery_prefix.trim_end_matches("/device/");
-        let announcements = topics::discovery(prefix, "+");
+        let announcements = self.discovery("+");
         let is_deaf = |filter: &str| filters.contains(&filter);
         let (no_state, no_announcement) = (is_deaf(&self.topics.bridge_state()), is_deaf(&announcements));
         let prefix = &self.discovery_prefix;

@@ -88,12 +88,8 @@ impl Outbox {
             self.held.topics.insert(topic);
         }
         self.tell_held_first();
-        let announcement = now.topic();
-        let Some(entry) = self.retained.get_mut(announcement) else { return };
         // The time begins when it is told, which it may have been.
-        if !std::mem::replace(&mut entry.queued, true) {
-            self.queue_last(Queued::Newest(announcement.into()));
-        }
+        self.tell_again(now.topic());
     }
 
     /// What the broker keeps of it may be the old thing's: it is taken back before anything is announced.
@@ -114,9 +110,8 @@ impl Outbox {
         }
         self.held.due = None;
         for topic in std::mem::take(&mut self.held.topics) {
-            let Some(entry) = self.retained.get_mut(&*topic) else { continue };
-            if entry.payload != "None" && !std::mem::replace(&mut entry.queued, true) {
-                self.queue_last(Queued::Newest(topic.into()));
+            if self.retained.get(&*topic).is_some_and(|entry| entry.payload != "None") {
+                self.tell_again(&topic);
             }
         }
     }

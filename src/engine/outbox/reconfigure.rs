@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use crate::engine::homeassistant::{self, Announcement};
 use crate::engine::settings::Settings;
-use crate::engine::topics::{self, Kind, Message, Topics};
+use crate::engine::topics::{Kind, Message, Topics};
 
 use super::{Outbox, Queued, Rank, Tree};
 
@@ -27,8 +27,9 @@ impl Outbox {
             self.keep_otherwise();
         }
         // Nothing of it that an earlier run has left is taken back before it is told.
-        self.own_devices
-            .extend(discovery_topics(&home_assistant.prefix, homeassistant::identities(settings)));
+        let own: Vec<String> =
+            homeassistant::identities(settings).into_iter().map(|own| self.discovery(&own)).collect();
+        self.own_devices.extend(own);
         self.wanted.extend(wanted.iter().cloned());
     }
 
@@ -38,9 +39,7 @@ impl Outbox {
             let is_value = self.topics.kind(&topic) == Kind::Value;
             let Some(entry) = self.retained.get_mut(&topic).filter(|_| is_value) else { continue };
             entry.kept = !self.values.retain;
-            if !std::mem::replace(&mut entry.queued, true) {
-                self.queue_last(Queued::Newest(topic));
-            }
+            self.tell_again(&topic);
         }
     }
 
@@ -56,8 +55,7 @@ impl Outbox {
         let told_earlier = before.difference(wanted).filter(|topic| !self.retained.contains_key(&***topic));
         self.left_behind.extend(told_earlier.cloned());
         self.wanted.clone_from(wanted);
-        let prefix = self.discovery_prefix.trim_end_matches("/device/");
-        self.own_devices = discovery_topics(prefix, identities).collect();
+        self.own_devices = identities.into_iter().map(|identity| self.discovery(&identity)).collect();
         let of_devices = self.in_order(|rank| !matches!(rank, Rank::Bridge | Rank::BridgeState));
         for topic in of_devices {
             if self.rank(&topic) == Rank::Discovery {
@@ -86,8 +84,7 @@ impl Outbox {
 
     /// Something will be announced anew: what it has no more is buried then.
     pub fn announced_anew(&mut self, identity: &str) {
-        let prefix = self.discovery_prefix.trim_end_matches("/device/");
-        let topic = topics::discovery(prefix, identity);
+        let topic = self.discovery(identity);
         let Some(entry) = self.retained.remove(&*topic) else { return };
         if let Some(found) = Announcement::parse(&self.topics, &topic, &entry.payload) {
             self.remembered.insert(topic, found);
@@ -154,13 +151,6 @@ impl Outbox {
         self.retained.remove(topic);
         self.queue_last(Queued::Removal(topic.to_string()));
     }
-}
-
-fn discovery_topics(
-    prefix: &str,
-    identities: impl IntoIterator<Item = String>,
-) -> impl Iterator<Item = String> {
-    identities.into_iter().map(move |identity| topics::discovery(prefix, &identity))
 }
 
 #[cfg(test)]
