@@ -158,7 +158,7 @@ impl Observed {
     fn look_at(&mut self, message: &Message) {
         if let Some(device) = message.topic.strip_suffix("/availability") {
             self.availability.insert(device.into(), message.payload.clone());
-            self.has_just_come = Some(device.into()).filter(|_| message.payload == "online");
+            self.has_just_come = (message.payload == "online").then(|| device.into());
         }
         if let Some(device) = message.topic.strip_suffix("/info") {
             let info: serde_json::Value = serde_json::from_str(&message.payload).expect("JSON");
