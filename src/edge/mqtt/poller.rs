@@ -50,7 +50,7 @@ impl<Tell: Fn(News)> Poller<Tell> {
                     continue;
                 }
             };
-            if self.seen.send(seen).await.is_err() {
+            if self.tell(seen).await.is_err() {
                 return;
             }
         }
@@ -87,13 +87,13 @@ impl<Tell: Fn(News)> Poller<Tell> {
     }
 
     /// Tells what is left of the connection, and waits before the next attempt.
-    async fn lost(&mut self, error: ConnectionError) -> Result<(), mpsc::error::SendError<Seen>> {
+    async fn lost(&mut self, error: ConnectionError) -> Result<(), NobodyListens> {
         // What came together with the end. The library would hand it out after the next connect,
         // when a command in it is no longer meant.
         for event in std::mem::take(&mut self.event_loop.state.events) {
             if let rumqttc::Event::Incoming(_) = event {
                 if let Some(seen) = self.seen(event) {
-                    self.seen.send(seen).await?;
+                    self.tell(seen).await?;
                 }
             }
         }
@@ -117,7 +117,7 @@ impl<Tell: Fn(News)> Poller<Tell> {
             true => self.ends.contested(),
             false => self.ends.reason(&error, was_made),
         };
-        self.seen.send(Seen::Down { reason, contested, suspect: after.suspect }).await?;
+        self.tell(Seen::Down { reason, contested, suspect: after.suspect }).await?;
         tokio::time::sleep(after.pause).await;
         // Only now, when nobody hands over more: the library would send what it still holds before
         // anything newer, or drop it.
@@ -129,7 +129,11 @@ impl<Tell: Fn(News)> Poller<Tell> {
         let unsent: Vec<Message> =
             requests.chain(collided).filter(|publish| !publish.retain).filter_map(once).collect();
         self.renew_secrets();
-        self.seen.send(Seen::Unsent(unsent)).await
+        self.tell(Seen::Unsent(unsent)).await
+    }
+
+    async fn tell(&mut self, seen: Seen) -> Result<(), NobodyListens> {
+        self.seen.send(seen).await.map_err(|_| NobodyListens)
     }
 
     /// They may have changed since the last attempt. While they cannot be read, the old ones are used.
@@ -149,6 +153,9 @@ impl<Tell: Fn(News)> Poller<Tell> {
         }
     }
 }
+
+/// The feeder has ended.
+struct NobodyListens;
 
 /// What the polling task saw.
 pub(super) enum Seen {
