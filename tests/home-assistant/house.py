@@ -32,6 +32,7 @@ BROKER_IS_AWAY = re.compile(
     r"|paho\.mqtt\.client: failed to receive on socket: \[Errno \d+\] (Connection reset by peer|Broken pipe)"
     r"|mqtt\.client: Failed to connect to MQTT server due to exception: \[Errno 111\] Connection refused"
     r"|ERROR homeassistant\.components\.mqtt\.util: (mqtt_broker_error|Error talking to MQTT: The client is not currently connected\.)"
+    r"|ERROR homeassistant: Error doing job: Task exception was never retrieved \(None\) \(HomeAssistantError\('mqtt_broker_error'\)\)"
     r")"
 )
 # Its thread may say so a little later.

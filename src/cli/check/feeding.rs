@@ -5,9 +5,8 @@
 //! does not say what that time is, only the polls are counted. What may come between: a read of everything
 //! else that is due at the same moment; other watchdogs and heartbeats; and of a device that has just fallen
 //! silent the wait for its answer, as long again in which the line is left alone, and a round of everything
-//! else that has become due meanwhile; and where polls are all that feeds, a bus that is behind gives a read that has
-//! been early its next turn up to a period later, so that all periods are stretched alike. Commands are not counted:
-//! they put a feeding off until two thirds of the time have passed, and no further.
+//! else that has become due meanwhile. Commands are not counted: they put a feeding off until two thirds of the
+//! time have passed, and no further.
 
 use serde::Serialize;
 
@@ -129,7 +128,7 @@ pub fn of_device(settings: &DeviceSettings, delays: Delays) -> Vec<Feeding> {
         // is silent among that.
         let asked_every = delays.asked_every.unwrap_or(f64::INFINITY);
         let polled_every = asked_every + delays.one_request + delays.round;
-        let polled_every_one_silent = polled_every + asked_every + delays.one_silent;
+        let polled_every_one_silent = polled_every + delays.one_silent;
         let [before, before_one_silent] =
             [delays.one_request, delays.one_silent].map(|delay| delay + delays.others_fed);
         let every = [polled_every.min(due + before), polled_every_one_silent.min(due + before_one_silent)];
