@@ -61,6 +61,8 @@ impl Served {
     fn compare(&self, broker: &Broker) -> Findings {
         let device = self.name();
         let watcher = Watcher::start_of(&format!("busker/{device}/#"), broker, &device, None);
+        // By then the gateway listens.
+        watcher.shows(&format!("busker/{device}/availability"), "online");
         let points = points(self.model.id());
         let mut found = Findings::default();
         // Some devices measure for seconds before they tell; meanwhile others can be written.
