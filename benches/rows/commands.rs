@@ -5,7 +5,6 @@ use std::time::Duration;
 
 use anyhow::Context;
 
-use super::saturated::cycles;
 use super::{AT_ONCE, Bench, Configured, REGISTERS, Rig, UNITS, W1_LINE, W1_TURNAROUND, points};
 use crate::clock::{sleep, sleep_until};
 use crate::machine::Watch;
@@ -80,11 +79,15 @@ pub fn w4(bench: &mut Bench) -> anyhow::Result<()> {
         transactions.iter().filter_map(|seen| seen.silence).filter(|found| *found < silence).count() as u64;
     let collisions = (violations + rig.wire.collisions() + rig.wire.damaged()) as f64;
 
-    // What is left to the polls when each command takes its write, and nothing else.
-    let cycles: Vec<f64> = cycles(&transactions).iter().map(|cycle| *cycle as f64).collect();
-    let mean = cycles.iter().sum::<f64>() / cycles.len() as f64;
-    let elapsed = cycles.iter().sum::<f64>();
-    let of_writes = writes.len() as f64 * W1_LINE.write(W1_TURNAROUND) as f64;
+    // What is left to the polls when each command takes its write, and nothing else. Of all units: one that was written
+    // to is read sooner for that, and others later.
+    let (last, done_before) = transactions.split_last().context("nothing was asked")?;
+    let first = done_before.first().context("only one thing was asked")?;
+    let late: i64 = done_before.iter().map(|seen| seen.wire_late).sum();
+    let elapsed = (last.heard_at - first.heard_at - late) as f64;
+    let of = |function: u8| done_before.iter().filter(|seen| seen.function == function).count() as f64;
+    let mean = elapsed * f64::from(UNITS) / of(3);
+    let of_writes = (of(6) + of(16)) * W1_LINE.write(W1_TURNAROUND) as f64;
     let minimum = (W1_LINE.read(REGISTERS, W1_TURNAROUND) * i64::from(UNITS)) as f64;
     let ratio = mean / (minimum * elapsed / (elapsed - of_writes));
     let extra = transactions

@@ -162,7 +162,7 @@ fn run(bench: &Bench, row: &'static str, behaviour: Behaviour, gapless: bool) ->
 }
 
 /// From one read of the first place to its next, less what the wire itself was late.
-pub fn cycles(transactions: &[Transaction]) -> Vec<i64> {
+fn cycles(transactions: &[Transaction]) -> Vec<i64> {
     let Some(first) = transactions.first() else { return Vec::new() };
     let (mut began, mut late, mut cycles) = (None, 0, Vec::new());
     for seen in transactions {
