@@ -29,29 +29,39 @@ pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
     let readings = Readings::taken_from(&mut report);
     let mut registry = Registry::with_prefix("busker");
     let flag = |on| if on { 1.0 } else { 0.0 };
-    let connected = OneGauge::default();
-    connected.set(flag(report.broker.connected));
-    registry.register("broker_connected", "Whether the broker is connected", connected);
-    let taken = OneGauge::default();
-    taken.set(flag(report.broker.client_id_taken));
-    let help = "Whether another client with the same identifier takes this one's place again and again";
-    registry.register("broker_client_id_taken", help, taken);
-    let denied = OneGauge::default();
-    denied.set(flag(report.broker.state_denied));
-    let help = "Whether others tell something else of this gateway's state again and again";
-    registry.register("broker_state_denied", help, denied);
-    let kept_back = OneGauge::default();
-    kept_back.set(report.broker.kept_back.len() as f64);
-    let help = "Topics that miss something, since the broker takes no message as long";
-    registry.register("broker_kept_back", help, kept_back);
-    let not_arriving = OneGauge::default();
-    not_arriving.set(report.broker.not_arriving.len() as f64);
-    let help = "Topics of which the broker does not hand on what is told there, although it confirms it";
-    registry.register("broker_not_arriving", help, not_arriving);
-    let by_others = OneGauge::default();
-    by_others.set(report.broker.announced_by_others.len() as f64);
-    let help = "Devices that another gateway announces to Home Assistant under the same identity";
-    registry.register("broker_announced_by_others", help, by_others);
+    let broker = &report.broker;
+    for (name, help, value) in [
+        ("connected", "Whether the broker is connected", flag(broker.connected)),
+        (
+            "client_id_taken",
+            "Whether another client with the same identifier takes this one's place again and again",
+            flag(broker.client_id_taken),
+        ),
+        (
+            "state_denied",
+            "Whether others tell something else of this gateway's state again and again",
+            flag(broker.state_denied),
+        ),
+        (
+            "kept_back",
+            "Topics that miss something, since the broker takes no message as long",
+            broker.kept_back.len() as f64,
+        ),
+        (
+            "not_arriving",
+            "Topics of which the broker does not hand on what is told there, although it confirms it",
+            broker.not_arriving.len() as f64,
+        ),
+        (
+            "announced_by_others",
+            "Devices that another gateway announces to Home Assistant under the same identity",
+            broker.announced_by_others.len() as f64,
+        ),
+    ] {
+        let gauge = OneGauge::default();
+        gauge.set(value);
+        registry.register(format!("broker_{name}"), help, gauge);
+    }
     counter(&mut registry, "broker_connects", "Connections made", report.broker.connects);
     counter(&mut registry, "messages_dropped", "Messages that waited too long", report.broker.dropped);
 
