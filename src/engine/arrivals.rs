@@ -58,6 +58,8 @@ pub struct Arrivals {
     former_states: Vec<String>,
     status_topic: String,
     filters: Vec<String>,
+    /// What was listened to before on the same connection: it may be on its way still.
+    before: Option<Box<Arrivals>>,
 }
 
 impl Arrivals {
@@ -70,7 +72,19 @@ impl Arrivals {
         filters.push(home_assistant.status_topic.clone());
         // What an earlier run announced, to take away what is gone; all of it without discovery.
         filters.push(topics::discovery(&home_assistant.prefix, "+"));
-        Arrivals { topics, former_states, status_topic: home_assistant.status_topic.clone(), filters }
+        let status_topic = home_assistant.status_topic.clone();
+        Arrivals { topics, former_states, status_topic, filters, before: None }
+    }
+
+    /// On a new connection nothing is on its way.
+    pub fn begin_anew(&mut self) {
+        self.before = None;
+    }
+
+    /// `now` is listened to from now on, on the same connection.
+    pub fn listen_to(&mut self, now: Arrivals) {
+        let before = std::mem::replace(self, now);
+        self.before = Some(Box::new(Arrivals { before: None, ..before }));
     }
 
     /// What to subscribe to, so that everything arrives that [`Arrivals::sort`] knows.
@@ -79,6 +93,13 @@ impl Arrivals {
     }
 
     pub fn sort<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
+        match (self.sort_present(mail), &self.before) {
+            (Arrival::Nothing, Some(before)) => before.sort_present(mail),
+            (arrival, _) => arrival,
+        }
+    }
+
+    fn sort_present<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
         let is_news = !mail.retained;
         if mail.topic == self.topics.bridge_state() {
             // What the broker has kept is followed by this gateway's own word.
@@ -157,6 +178,22 @@ mod tests {
         ];
         assert_eq!(arrivals("").filters(), all);
         assert_eq!(arrivals("home_assistant: {discovery: false}\n").filters(), all);
+    }
+
+    #[test]
+    fn what_was_listened_to_before_is_heard_until_the_connection_is_another() {
+        let mut arrivals = arrivals("home_assistant: {status_topic: ha/status}\n");
+        let started = |arrivals: &Arrivals, topic: &str| {
+            let mail = Mail { topic, payload: ONLINE, retained: false, repeated: false, stale_for: None };
+            arrivals.sort(&mail) == Arrival::HomeAssistantStarted
+        };
+        let both =
+            |arrivals: &Arrivals| ["ha/status", "homeassistant/status"].map(|topic| started(arrivals, topic));
+        assert_eq!(both(&arrivals), [true, false]);
+        arrivals.listen_to(self::arrivals(""));
+        assert_eq!(both(&arrivals), [true, true]);
+        arrivals.begin_anew();
+        assert_eq!(both(&arrivals), [false, true]);
     }
 
     /// `news` is what it is when it is told just now, `retained` when the broker has kept it.

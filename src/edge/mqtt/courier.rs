@@ -34,45 +34,34 @@ pub enum News {
 
 /// Brings news where they belong; whoever hears of something hands it over.
 pub(super) struct Courier<Tell> {
-    listening: Mutex<Listening>,
+    arrivals: Mutex<Arrivals>,
     tell: Tell,
-}
-
-struct Listening {
-    arrivals: Arrivals,
-    /// What was listened to before on this connection: it may be on its way still.
-    before: Option<Arrivals>,
 }
 
 impl<Tell: Fn(News)> Courier<Tell> {
     /// `tell` must not wait.
     pub fn new(arrivals: Arrivals, tell: Tell) -> Courier<Tell> {
-        Courier { listening: Mutex::new(Listening { arrivals, before: None }), tell }
+        Courier { arrivals: Mutex::new(arrivals), tell }
     }
 
-    /// On a new connection, where nothing is on its way: says what to subscribe to.
+    /// On a new connection: says what to subscribe to.
     pub fn begin_anew(&self) -> Vec<String> {
-        let mut listening = lock(&self.listening);
-        listening.before = None;
-        listening.arrivals.filters().to_vec()
+        let mut arrivals = lock(&self.arrivals);
+        arrivals.begin_anew();
+        arrivals.filters().to_vec()
     }
 
     /// Listens to this from now on, on the same connection; says what was subscribed to before.
-    pub fn listen_to(&self, arrivals: Arrivals) -> Vec<String> {
-        let mut listening = lock(&self.listening);
-        let before = std::mem::replace(&mut listening.arrivals, arrivals);
-        let filters = before.filters().to_vec();
-        listening.before = Some(before);
+    pub fn listen_to(&self, now: Arrivals) -> Vec<String> {
+        let mut arrivals = lock(&self.arrivals);
+        let filters = arrivals.filters().to_vec();
+        arrivals.listen_to(now);
         filters
     }
 
     /// Says what a message is to this gateway.
     pub fn sort<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
-        let listening = lock(&self.listening);
-        match (listening.arrivals.sort(mail), &listening.before) {
-            (Arrival::Nothing, Some(before)) => before.sort(mail),
-            (arrival, _) => arrival,
-        }
+        lock(&self.arrivals).sort(mail)
     }
 
     pub fn tell(&self, news: News) {
