@@ -82,6 +82,21 @@ fn launch(folder: &TempDir, port: u16) -> anyhow::Result<Option<Child>> {
     Ok(None)
 }
 
+/// How many answers came, and how long devices took to begin them, all together.
+#[derive(Clone, Copy)]
+pub struct Turnarounds {
+    seconds: f64,
+    count: f64,
+}
+
+impl Turnarounds {
+    /// The mean of those that came after `before`; `None` where none did.
+    pub fn since(self, before: Turnarounds) -> Option<Duration> {
+        let count = self.count - before.count;
+        (count >= 1.0).then(|| Duration::from_secs_f64((self.seconds - before.seconds) / count))
+    }
+}
+
 /// A running gateway.
 pub struct Busker {
     child: Child,
@@ -157,8 +172,8 @@ impl Busker {
         machine::cpu_seconds(self.child.id())
     }
 
-    /// How long devices took to answer, on average, as it tells Prometheus; since it began, over all of them.
-    pub fn turnaround(&mut self) -> anyhow::Result<Duration> {
+    /// The answers of all devices since it began, as it tells Prometheus.
+    pub fn turnarounds(&mut self) -> anyhow::Result<Turnarounds> {
         let mut page =
             ureq::get(format!("http://{}/metrics", self.http()?)).call().context("HTTP answers")?;
         let text = page.body_mut().read_to_string().context("the page of metrics")?;
@@ -168,11 +183,7 @@ impl Busker {
                 .filter(|line| line.starts_with(&format!("busker_device_turnaround_seconds_{name}{{")));
             lines.filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok()).sum()
         };
-        let (sum, count) = (all("sum"), all("count"));
-        if count < 1.0 {
-            bail!("it tells no turnaround");
-        }
-        Ok(Duration::from_secs_f64(sum / count))
+        Ok(Turnarounds { seconds: all("sum"), count: all("count") })
     }
 
     /// In bytes.
