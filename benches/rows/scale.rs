@@ -158,6 +158,6 @@ fn run(size: Size, time: Duration) -> anyhow::Result<Run> {
         registers_per_second: reached.registers_per_second,
         announced_after: (last_at - busker.started_at) as f64 / 1e9,
     };
-    let forecast = forecast("scale", &mut busker, &servers, size.points * size.words, time / 2)?;
+    let forecast = forecast("scale", &mut busker, &servers, size.points * size.words, time)?;
     Ok(Run { growth, reached, forecast, libmodbus, why, noise })
 }
