@@ -3,8 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use anyhow::Context;
-
 use crate::edge::app::{
     App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, watch, watched,
 };
@@ -49,10 +47,14 @@ impl App {
         if state.as_ref().is_some_and(|state| !is_kept(state) || !is_kept(&self.state.now())) {
             change.every_device_begins_anew(&old, &settings);
         }
-        let http_ends = change.http || keys.token != self.keys.token;
-        let listen = settings.http.listen.clone();
+        // One that could not come back is tried again, whatever has changed.
+        let http_is_missing = self.http.is_none() && settings.http.listen.is_some();
+        let http_ends = change.http || keys.token != self.keys.token || http_is_missing;
         if change.is_nothing() && keys == self.keys {
             tracing::info!("the new configuration changes nothing that runs");
+        }
+        if http_ends {
+            self.exchange_http(listener, &old, &settings, keys.token.clone())?;
         }
         self.exchange(&old, settings, library, state, &change)?;
         let reconnects = change.broker || !keys.is_same_broker(&self.keys);
@@ -60,9 +62,6 @@ impl App {
         if reconnects {
             tracing::info!("the connection to the broker is made anew");
             self.reconnect(secrets);
-        }
-        if http_ends {
-            self.exchange_http(listener, listen.as_deref())?;
         }
         self.reporter.set_configuration_error(None);
         self.plant.stir().stir();
@@ -266,25 +265,39 @@ impl App {
         self.broker = Some(connect(&self.plant, secrets, self.clock));
     }
 
-    fn exchange_http(&mut self, listener: Option<Bound>, listen: Option<&str>) -> anyhow::Result<()> {
+    /// An error means that it listens where it did, as far as it still can.
+    fn exchange_http(
+        &mut self,
+        listener: Option<Bound>,
+        old: &Settings,
+        new: &Settings,
+        token: Option<String>,
+    ) -> anyhow::Result<()> {
+        let port = self.http_address().map(|address| address.port());
         if let Some(http) = self.http.take() {
             self.runtime.block_on(http.finish());
         }
-        let listener = match (listener, listen) {
-            (Some(listener), _) => Some(listener),
-            (None, Some(listen)) => {
-                let bound = self.runtime.block_on(Http::bind(listen));
-                Some(bound.context("the new configuration works only in part")?)
+        let bind = |listen: &str| self.runtime.block_on(Http::bind(listen));
+        let bound = match (listener, &new.http.listen) {
+            (Some(listener), _) => Ok(Some(listener)),
+            (None, Some(listen)) => bind(listen).map(Some),
+            (None, None) => Ok(None),
+        };
+        let (listener, token, failed) = match bound {
+            Ok(listener) => (listener, token, None),
+            Err(error) => {
+                let host = old.http.listen.as_deref().and_then(|listen| listen.rsplit_once(':'));
+                let before =
+                    host.zip(port).and_then(|((host, _), port)| bind(&format!("{host}:{port}")).ok());
+                (before, self.keys.token.clone(), Some(error))
             }
-            (None, None) => None,
         };
         let _inside = self.runtime.enter();
-        let token = self.keys.token.clone();
         self.http = listener.map(|listener| Http::serve(listener, self.reporter.clone(), self.clock, token));
         if let Some(address) = self.http_address() {
             tracing::info!("HTTP on http://{address}/health");
         }
-        Ok(())
+        failed.map_or(Ok(()), Err)
     }
 }
 

@@ -159,9 +159,11 @@ impl StateFiles {
 
     /// Puts a memory where it will be stored. Does not wait for that.
     pub fn store(&self, record: Record) {
-        let Some(kept) = &self.kept else { return };
-        if !lock(&kept.damaged).contains(&record.device) {
-            lock(&self.memories).devices.insert(record.device.clone(), record.memory.clone());
+        // Also what is not kept is remembered until the end: devices may begin anew before.
+        let Record { device, memory } = &record;
+        let is_kept = self.kept.as_ref().filter(|kept| !lock(&kept.damaged).contains(device));
+        lock(&self.memories).devices.insert(device.clone(), memory.clone());
+        if let Some(kept) = is_kept {
             kept.writer.store(record);
         }
     }
@@ -284,12 +286,14 @@ fn keep_aside(path: &Path) -> io::Result<PathBuf> {
     Err(io::Error::other("there are 99 damaged ones already"))
 }
 
-/// Whether files can be made in `folder`, which is made if it is not there.
+/// Whether files can be made in `folder`, which is made if it is not there, and filled: on a full disk only empty ones
+/// can be made.
 fn probe(folder: &Path) -> io::Result<()> {
     fs::create_dir_all(folder)?;
     let path = folder.join(".probe");
-    File::create(&path)?;
-    fs::remove_file(&path)
+    let written = fs::write(&path, [b'\n'; 4096]);
+    let removed = fs::remove_file(&path);
+    written.and(removed)
 }
 
 #[cfg(test)]

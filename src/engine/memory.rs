@@ -3,7 +3,7 @@
 //! A [`Memory`] is one small file for each device; the edge keeps the files, and here is what stands
 //! in them. Nothing in it is needed to run: without it, everything is as at the first start.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
@@ -26,6 +26,8 @@ pub struct Memory {
     pub persistent_writes: u64,
     /// How many of them still lessen the day's budget.
     pub writes_spent: Option<u32>,
+    /// The points that had been written so lately that they were to be spared.
+    pub written_lately: BTreeSet<String>,
     /// The section `settings` as it was last seen: points and what they shall hold.
     pub section: BTreeMap<String, String>,
     /// The settings of that section for which all has been done, and how that ended: `done`,
@@ -57,6 +59,8 @@ struct File {
     persistent_writes: u64,
     #[serde(default)]
     writes_spent: Option<u32>,
+    #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
+    written_lately: BTreeSet<String>,
     /// Kept before `writes_spent` was: what is left says nothing where the budget has changed since.
     #[serde(default, skip_serializing, rename = "writes_left")]
     _writes_left: Option<u32>,
@@ -80,6 +84,7 @@ impl Memory {
             refused: refused.collect::<Result<_, _>>()?,
             persistent_writes: file.persistent_writes,
             writes_spent: file.writes_spent,
+            written_lately: file.written_lately,
             section: file.settings,
             settled: file.settled,
         })
@@ -93,6 +98,7 @@ impl Memory {
             refused: self.refused.iter().map(Span::to_string).collect(),
             persistent_writes: self.persistent_writes,
             writes_spent: self.writes_spent,
+            written_lately: self.written_lately.clone(),
             _writes_left: None,
             settings: self.section.clone(),
             settled: self.settled.clone(),
@@ -125,6 +131,7 @@ mod tests {
             refused: vec![<Span as Scalar>::parse("holding 3..7").expect("a span")],
             persistent_writes: 12,
             writes_spent: Some(12),
+            written_lately: BTreeSet::from(["watchdog".to_string()]),
             section: map(&[("mode", "pt1000"), ("watchdog", "30s")]),
             settled: map(&[("watchdog", "done")]),
         }

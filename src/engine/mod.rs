@@ -13,6 +13,7 @@ pub mod value;
 pub mod codec;
 pub mod configuration;
 pub mod device;
+pub mod keys;
 pub mod profile;
 pub mod settings;
 pub mod units;

@@ -8,7 +8,18 @@ use std::path::{Path, PathBuf};
 /// Within a paragraph of `engine/mod.rs` rustfmt sorts the names; the order within is this one.
 const ENGINE_ORDER: &[&[&str]] = &[
     &["time", "value", "address"],
-    &["yaml", "device", "test_device", "codec", "units", "settings", "profile", "wanted", "configuration"],
+    &[
+        "yaml",
+        "device",
+        "test_device",
+        "codec",
+        "units",
+        "keys",
+        "settings",
+        "profile",
+        "wanted",
+        "configuration",
+    ],
     &["modbus", "recorder", "plan", "schedule"],
     &["identity", "state"],
     &["topics", "health", "feed", "homeassistant", "outbox", "connection"],

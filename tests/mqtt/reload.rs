@@ -457,3 +457,26 @@ fn http_moves_to_another_address() {
     gateway.reload(DONE);
     find(|| status(moved).is_none().then_some(())).expect("HTTP is off");
 }
+
+#[test]
+fn http_stays_where_it_was_if_its_new_address_is_taken() {
+    let (broker, witness) = (Broker::start(), Witness::start());
+    let (steady, pump) = steady(&witness);
+    let text = text(&broker, &[&steady], &[&pump]);
+    let gateway = Gateway::start_with(&text);
+    let port = gateway.http().rsplit(':').next().expect("a port").to_string();
+    // The same port, so that the old address has to be left first; and another program has a part of the new one.
+    let taken = TcpListener::bind(format!("127.0.0.2:{port}")).expect("nobody else is there");
+    let everywhere = text.replace("flow", "rate");
+    let state = gateway.state();
+    gateway.write_whole(&format!(
+        "http: {{listen: '0.0.0.0:{port}'}}\nstate_dir: {}\n{everywhere}",
+        state.display()
+    ));
+    gateway.reload("HTTP cannot listen on");
+    let points = || find(|| Some(gateway.get("/api/devices").1)).expect("HTTP answers");
+    assert!(points().contains("\"flow\"") && !points().contains("\"rate\""), "{}", points());
+    drop(taken);
+    gateway.reload(DONE);
+    assert!(points().contains("\"rate\""), "{}", points());
+}

@@ -91,43 +91,51 @@ impl Desk {
     fn work(&self, folder: &Path) {
         let mut failed = false;
         loop {
-            let (memories, others, finish) = self.take(failed);
-            for (name, text) in others {
-                let path = folder.with_file_name(name);
-                if let Err(error) = replace(&path, &text) {
-                    // The broker most likely remembers it too.
-                    tracing::warn!("`{}` cannot be stored: {error}", path.display());
-                }
-            }
-            for (device, memory) in memories {
-                match replace(&file_of(folder, &device), &memory.to_text()) {
-                    Ok(()) if failed => {
-                        failed = false;
-                        tracing::info!("`{}` can be written again", folder.display());
-                    }
-                    Ok(()) => {}
-                    Err(error) if finish => {
-                        tracing::error!("the state of {device} is lost, since it cannot be stored: {error}");
-                    }
-                    Err(error) => {
-                        if !failed {
-                            let path = file_of(folder, &device);
-                            tracing::warn!("`{}` cannot be stored: {error}", path.display());
-                        }
-                        failed = true;
-                        // What has come meanwhile is newer.
-                        self.lock().memories.entry(device).or_insert(memory);
-                    }
-                }
-            }
+            let batch = self.take(failed);
+            let finish = batch.finish;
+            failed = self.store(folder, batch, failed);
             if finish {
                 return;
             }
         }
     }
 
+    /// Whether some of it could not be stored, and lies on the desk again; `failed`: as the last time.
+    fn store(&self, folder: &Path, batch: Waiting, failed: bool) -> bool {
+        let Waiting { memories, others, finish } = batch;
+        let mut fails = false;
+        let mut could = |path: &Path, what: &str, text: &str| {
+            let Err(error) = replace(path, text) else { return true };
+            match finish {
+                true => tracing::error!("{what} is lost, since it cannot be stored: {error}"),
+                false if !failed && !fails => {
+                    tracing::warn!("`{}` cannot be stored, and is tried again: {error}", path.display());
+                }
+                false => {}
+            }
+            fails = true;
+            false
+        };
+        // What has come meanwhile is newer.
+        for (name, text) in others {
+            if !could(&folder.with_file_name(name), &format!("what belongs in `{name}`"), &text) {
+                self.lock().others.entry(name).or_insert(text);
+            }
+        }
+        for (device, memory) in memories {
+            let what = format!("the state of {device}");
+            if !could(&file_of(folder, &device), &what, &memory.to_text()) {
+                self.lock().memories.entry(device).or_insert(memory);
+            }
+        }
+        if failed && !fails {
+            tracing::info!("`{}` can be written again", folder.display());
+        }
+        fails
+    }
+
     /// Waits for something to store, or for the end. After a failure, what waits may wait.
-    fn take(&self, failed: bool) -> (BTreeMap<String, Memory>, BTreeMap<&'static str, String>, bool) {
+    fn take(&self, failed: bool) -> Waiting {
         let mut waiting = self.lock();
         if failed && !waiting.finish {
             let until_finish = |waiting: &mut Waiting| !waiting.finish;
@@ -139,7 +147,8 @@ impl Desk {
         };
         let mut waiting =
             self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
-        (std::mem::take(&mut waiting.memories), std::mem::take(&mut waiting.others), waiting.finish)
+        let finish = waiting.finish;
+        Waiting { finish, ..std::mem::take(&mut *waiting) }
     }
 }
 
@@ -147,4 +156,32 @@ impl Desk {
 fn replace(path: &Path, text: &str) -> io::Result<()> {
     fs::create_dir_all(path.parent().unwrap_or(Path::new(".")))?;
     files::replace(path, &path.with_extension("json.new"), 0o666, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_could_not_be_stored_is_stored_when_there_is_room_again() {
+        let state_dir = tempfile::tempdir().expect("a folder");
+        let folder = state_dir.path().join("devices");
+        let paths = [state_dir.path().join("announced.json"), folder.join("one.json")];
+        for path in &paths {
+            fs::create_dir_all(path.with_extension("json.new")).expect("something is in the way");
+        }
+        let desk = Desk::default();
+        desk.lay(|waiting| {
+            waiting.others.insert("announced.json", "{}".into());
+            waiting.memories.insert("one".into(), Memory::default());
+        });
+        assert!(desk.store(&folder, desk.take(false), false));
+        for path in &paths {
+            assert!(!path.exists());
+            fs::remove_dir(path.with_extension("json.new")).expect("it is empty");
+        }
+        desk.lay(|waiting| waiting.finish = true);
+        desk.work(&folder);
+        assert!(paths.iter().all(|path| path.exists()), "{paths:?}");
+    }
 }

@@ -124,7 +124,7 @@ impl Bus {
         self.devices.iter_mut().zip(rests.by_ref()).for_each(|(device, rest)| device.idle_rest = rest);
         for (settings, rest) in devices.into_iter().zip(rests) {
             let mut device = DeviceState::new(settings, tariff, rest, self.rules.eeprom);
-            self.counters.persistent_writes += device.recall(memories);
+            self.counters.persistent_writes += device.recall(self.now, memories);
             device.introduce(self.now, &mut self.context);
             if self.link_state == LinkState::Up {
                 device.reconnect(self.now);

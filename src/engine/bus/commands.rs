@@ -23,6 +23,8 @@ pub(super) struct Active {
     /// When it came, until its first request is on its way; not of a setting, which nobody gave.
     pub(super) came_at: Option<Time>,
     flow: CommandFlow,
+    /// It began before its EEPROM may be written again, since the device seems to hold what is wanted.
+    is_early: bool,
     /// What of a thing's command is still to be written.
     orders: VecDeque<(PointIndex, String)>,
 }
@@ -300,7 +302,9 @@ impl Bus {
         let state = &self.devices[device];
         match CommandFlow::begin(state.device(), point, &value, state.known()) {
             Ok((flow, call)) => {
-                let active = Active { device, target, wanted, came_at, flow, orders };
+                let is_point = matches!(target, Target::Point(_));
+                let is_early = is_point && self.now < state.writable_at(target);
+                let active = Active { device, target, wanted, came_at, flow, is_early, orders };
                 self.take_step(active, Step::Ask(call));
             }
             Err(outcome) => {
@@ -351,6 +355,8 @@ impl Bus {
                 let until = self.now + POLL_AWAITED;
                 self.settling.push(Settling { until, active, then: Then::ReadBackUnlessPolled });
             }
+            // The device holds something else by now.
+            Step::Ask(call) if active.is_early && call.is_write() => self.let_wait_again(active),
             Step::Ask(call) => {
                 if let (true, Some(reason)) =
                     (call.is_write(), self.devices[device].is_spent(self.now, point))
@@ -419,6 +425,22 @@ impl Bus {
             let step = active.flow.answered(state.device(), state.known(), &Ok(Answer::Words(own_words)));
             self.take_step(active, step);
         }
+    }
+
+    /// Nothing has been written of it, nor may be yet.
+    fn let_wait_again(&mut self, active: Active) {
+        let device = active.device;
+        if self.is_overtaken(&active) {
+            let outcome = active.wanted.ended(OutcomeKind::Expired, REPLACED);
+            return self.end_command(active, outcome);
+        }
+        let from = self.devices[device].writable_at(active.target);
+        let waiting = Waiting::new(from, device, active.target, active.wanted, false);
+        for (replaced, reason) in self.waiting.push(waiting) {
+            let outcome = replaced.wanted.ended(OutcomeKind::Expired, reason);
+            self.tell_outcome(replaced.device, replaced.target, outcome);
+        }
+        self.tell_what_waits(device);
     }
 
     fn end_command(&mut self, active: Active, outcome: Outcome) {

@@ -259,7 +259,7 @@ impl Bus {
             .collect();
         let mut counters = Counters::default();
         for device in &mut devices {
-            counters.persistent_writes += device.recall(memories);
+            counters.persistent_writes += device.recall(now, memories);
             device.introduce(now, &mut context);
         }
         let record_due_at = devices.iter().filter_map(DeviceState::record_due_at).min();

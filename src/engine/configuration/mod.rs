@@ -5,6 +5,7 @@
 
 mod broker;
 pub mod file;
+mod identities;
 mod links;
 mod secrets;
 mod wanted;
@@ -13,7 +14,6 @@ mod words;
 
 pub use words::BAUD_RATES;
 
-use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -293,7 +293,7 @@ impl Resolver<'_> {
                 let settings = read_part(&device.settings);
                 let wanted = settings.map(|settings| wanted::check(settings, &resolved, &mut self.faults));
                 let raw_write = device.raw_write.get().map(|spans| self.raw_write(spans, &resolved));
-                self.identities(name, &resolved, &devices);
+                self.identities(name, &resolved, &devices, file);
                 devices.push(DeviceSettings {
                     name: name.0.clone(),
                     title: device.name.clone().unwrap_or_else(|| device::sentence(&name.0)),
@@ -334,42 +334,6 @@ impl Resolver<'_> {
             }
         }
         spans().map(|span| span.value).collect()
-    }
-
-    /// What Home Assistant knows a point by is made of the device's name and the point's: `a` with `b_c` is
-    /// `a_b` with `c` to it, and of two with one identity it refuses the second.
-    fn identities(&mut self, name: &At<Name>, device: &Device, others: &[DeviceSettings]) {
-        for other in others {
-            let (own, others_own) = (name.0.as_str(), other.name.as_str());
-            let same = match (rest_behind(own, others_own), rest_behind(others_own, own)) {
-                (Some(rest), _) => shared_name(rest, device, &other.device),
-                (_, Some(rest)) => shared_name(rest, &other.device, device).map(|(a, b)| (b, a)),
-                _ => None,
-            };
-            if let Some((point, others_point)) = same {
-                let message = format!(
-                    "`{own}` with its point `{point}` and `{others_own}` with its point `{others_point}` are both \
-                     `{own}_{point}` to Home Assistant; give one of the devices another name"
-                );
-                self.faults.add(&name.place, message);
-            }
-        }
-    }
-
-    fn device_name(&mut self, name: &At<Name>, file: &Configuration) {
-        if name.0 == "bridge" {
-            self.faults.add(&name.place, "`bridge` is the gateway's own name; give the device another one");
-        }
-        let of_a_bus = name.0.strip_prefix("bus_").map(|bus| Name(bus.into()));
-        if let Some(bus) = of_a_bus.filter(|bus| file.buses.get().is_some_and(|buses| buses.names(bus))) {
-            self.faults.add(
-                &name.place,
-                format!(
-                    "`{}` is how Home Assistant knows the bus `{}`; give the device another name",
-                    name.0, bus.0
-                ),
-            );
-        }
     }
 
     /// The index of a device's bus; the device's unit is checked against it.
@@ -481,24 +445,6 @@ impl Resolver<'_> {
             self.faults.add(&found.place, format!("{value} is out of range; expected {least} to {most}"));
         }
     }
-}
-
-/// What stands in `long` behind `short` and a `_`.
-fn rest_behind<'n>(long: &'n str, short: &str) -> Option<&'n str> {
-    long.strip_prefix(short)?.strip_prefix('_')
-}
-
-/// The first point or thing of `long` that with `rest` in front is called as one of `short`, and that one.
-fn shared_name(rest: &str, long: &Device, short: &Device) -> Option<(String, String)> {
-    fn names(device: &Device) -> impl Iterator<Item = &str> {
-        let points = device.points.iter().map(|point| &*point.name);
-        points.chain(device.things.iter().map(|thing| &*thing.name))
-    }
-    let taken: BTreeSet<&str> = names(short).collect();
-    names(long)
-        .map(|name| (name, format!("{rest}_{name}")))
-        .find(|(_, whole)| taken.contains(whole.as_str()))
-        .map(|(name, whole)| (name.to_string(), whole))
 }
 
 /// Many devices of one profile are kept once. Of those that wish something of their own there may be as

@@ -3,19 +3,39 @@
 /// `text` with a `*` for each byte of a password, so that every place stays where it is. Works on the
 /// text and not on what it means: a password may be the very thing that makes it unreadable.
 pub fn hidden(text: &str) -> String {
-    text.split_inclusive('\n').map(hidden_in_line).collect()
+    let mut shown = String::new();
+    // How far the key is indented whose value is a secret and stands in the lines behind it.
+    let mut goes_on: Option<usize> = None;
+    for line in text.split_inclusive('\n') {
+        let indent = line.len() - line.trim_start_matches([' ', '\t']).len();
+        goes_on = goes_on.filter(|of_key| indent > *of_key || line.trim().is_empty());
+        let from = goes_on.map_or_else(|| secret_in_line(line), |_| Some(indent));
+        shown += &hidden_in_line(line, from);
+        // The rest of a text in quotes or braces, or what `|` or nothing behind the key announces.
+        goes_on = goes_on.or(from.map(|_| indent));
+    }
+    shown
 }
 
-fn hidden_in_line(line: &str) -> String {
-    let mut hidden = line.as_bytes().to_vec();
+/// Where the value of a key that looks like a secret's begins.
+fn secret_in_line(line: &str) -> Option<usize> {
     // `password: …` and `token: …`, also misspelt, but not `password_file: …`.
-    for (at, _) in line.match_indices("pas").chain(line.match_indices("tok")) {
-        let word_end =
-            line[at..].find(|c: char| !c.is_ascii_alphanumeric()).map_or(line.len(), |end| at + end);
-        let after = line[word_end..].trim_start_matches(['"', '\'', ' ']);
-        if let Some(value) = after.strip_prefix(':') {
-            stars(&mut hidden[line.len() - value.len()..]);
-        }
+    let beginnings = ["pas", "tok", "secret", "pwd", "pw"];
+    let keys = beginnings.iter().flat_map(|word| line.match_indices(word));
+    let values = keys.filter_map(|(at, word)| {
+        let end = line[at..].find(|c: char| !c.is_ascii_alphanumeric()).map_or(line.len(), |end| at + end);
+        // A `pwm` is none.
+        let is_one = word != "pw" || end == at + 2;
+        let value = line[end..].trim_start_matches(['"', '\'', ' ']).strip_prefix(':')?;
+        is_one.then_some(line.len() - value.len())
+    });
+    values.min()
+}
+
+fn hidden_in_line(line: &str, from: Option<usize>) -> String {
+    let mut hidden = line.as_bytes().to_vec();
+    if let Some(from) = from {
+        stars(&mut hidden[from..]);
     }
     // `mqtt://user:password@host`; a password may hold an `@` itself.
     if let (Some(start), Some(end)) = (line.find("://"), line.rfind('@')) {
@@ -60,6 +80,12 @@ mod tests {
             ("url: joe:pw@host\n", "url: ******@host\n"),
             ("url: mqtt://host:1\n", "url: mqtt://host:1\n"),
             ("url: 'wss://host/mqtt?token=x', a: b\n", "url: 'wss://host/mqtt?*******', a: b\n"),
+            ("  pw: abc\n  secret: abc\n  pwm: 5\n", "  pw: ***\n  secret: ***\n  pwm: 5\n"),
+            (
+                "  password:\n    - s3cret\n\n    x: y\n  url: a\n",
+                "  password:\n    * ******\n\n    ** *\n  url: a\n",
+            ),
+            ("  password: 'two\n    words'\nbuses:\n", "  password: ****\n    ******\nbuses:\n"),
             ("serial: /dev/serial/by-id/usb@1\n", "serial: /dev/serial/by-id/usb@1\n"),
         ] {
             assert_eq!(hidden(text), shown);

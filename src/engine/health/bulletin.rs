@@ -1,5 +1,5 @@
-//! When how the gateway is is looked at and told: what changes for the worse or the better at once, all the rest
-//! each minute.
+//! When how the gateway is is looked at and told: what changes for the worse or the better at once, of a device too,
+//! all the rest each minute.
 
 use super::json::info_json;
 use super::{BrokerReport, GatewayReport, TOLD_EVERY};
@@ -22,6 +22,8 @@ pub struct Bulletin {
     told: Option<Standing>,
     /// Where it was told.
     places: Vec<String>,
+    /// Whether each device was online when its own health was told.
+    online: Vec<bool>,
     info: Message,
 }
 
@@ -48,6 +50,7 @@ impl Bulletin {
             due: Time::default(),
             told: None,
             places: Vec::new(),
+            online: Vec::new(),
             info: info(settings),
         }
     }
@@ -78,9 +81,15 @@ impl Bulletin {
         }
         if is_due {
             self.due = now + TOLD_EVERY;
-            messages.extend(of_devices.into_iter().map(|(topic, bus, device)| {
-                Message::retained(topic, device.health_json(&bus.name).to_string())
-            }));
+            self.online.clear();
+        }
+        // What its health says must not be denied by its availability for a minute.
+        self.online.resize(of_devices.len(), false);
+        for ((topic, bus, device), was_online) in of_devices.into_iter().zip(&mut self.online) {
+            if is_due || *was_online != device.online {
+                *was_online = device.online;
+                messages.push(Message::retained(topic, device.health_json(&bus.name).to_string()));
+            }
         }
         let info = Message::retained(topics.bridge_info(), report.info_json(settings).to_string());
         if self.info != info {
@@ -176,8 +185,11 @@ mod tests {
             report.buses[0].report.paused = true;
             report
         };
+        let one_is_lost = ["busker/bridge/health", "busker/d1/health"];
+        check(&mut bulletin, 2, &gateway(true, true, true, &[true, false]), &one_is_lost);
+        check(&mut bulletin, 3, &gateway(true, true, true, &[true, false]), &[]);
+        check(&mut bulletin, 3, &good, &one_is_lost);
         for changed in [
-            gateway(true, true, true, &[true, false]),
             gateway(true, true, false, &[true, true]),
             gateway(true, false, true, &[true, true]),
             gateway(false, true, true, &[true, true]),

@@ -1,10 +1,11 @@
 //! The buttons that stand beside a point's entity, for what that itself cannot be set to.
 
 use super::entity::Entity;
-use super::point::{category, entity, slug};
+use super::point::{category, entity};
 use super::thing;
 use crate::engine::codec;
-use crate::engine::device::{Device, Platform, Point, PointIndex, WriteRule};
+use crate::engine::device::{Device, Platform, Point, PointIndex};
+use crate::engine::keys;
 
 /// The buttons that stand beside an entity: one for each name that can be written to the point and
 /// that the entity itself cannot show. `automatic` is no number, so a number cannot be set to it.
@@ -16,23 +17,12 @@ pub fn companions(device: &Device, index: PointIndex, known: &[Option<i128>]) ->
     // What a thing commands has no controls of its own.
     let Some(shown) = thing::as_shown(device, index, known) else { return Vec::new() };
     let point = &*shown;
-    let names: Vec<&str> = match (point.write.as_ref().map(|write| &write.rule), main.platform) {
-        (Some(WriteRule::Names(names)), Platform::Sensor | Platform::BinarySensor) => {
-            names.iter().map(String::as_str).collect()
-        }
-        (Some(WriteRule::Any | WriteRule::Range { .. }), Platform::Number) => {
-            resolved.form.names.list().iter().map(|(_, name)| name.as_str()).collect()
-        }
-        _ => Vec::new(),
-    };
+    let names = keys::names_beside(point, resolved.form, main.platform);
     names.into_iter().map(|name| button_beside(device, point, &main, name)).collect()
 }
 
 fn button_beside(device: &Device, point: &Point, main: &Entity, name: &str) -> Entity {
-    let mut key = format!("{}_{}", main.key, slug(name));
-    while device.points.iter().any(|other| other.name == key) {
-        key.push_str("_button");
-    }
+    let key = keys::of_button(device, &main.key, name);
     Entity {
         category: category(point, Platform::Button),
         enabled: main.enabled,

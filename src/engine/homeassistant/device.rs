@@ -10,6 +10,7 @@ use super::point::entity;
 use super::thing::thing_component;
 use crate::engine::device::{Platform, Poll, ThingKind, sentence};
 use crate::engine::health::TOLD_EVERY;
+use crate::engine::keys::{EEPROM_WRITES, WIRE};
 use crate::engine::settings::DeviceSettings;
 use crate::engine::topics::DeviceTopics;
 
@@ -83,7 +84,7 @@ fn expires_after(gateway: &Gateway, device: &DeviceSettings, poll: Poll, platfor
 
 /// How the device is on its wire.
 fn diagnostics(gateway: &Gateway, identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> Components {
-    let (topic, entity, key, object) = (own.health(), &device.name, "wire_", "value_json");
+    let (topic, entity, key, object) = (own.health(), &device.name, WIRE, "value_json");
     let expiry = gateway.expiry(TOLD_EVERY);
     let place = Place { identity, entity, key, topic: &topic, object, may_lack: false, expiry };
     let mut components = place.times(&["turnaround_p95"]);
@@ -101,9 +102,6 @@ fn diagnostics(gateway: &Gateway, identity: &str, own: &DeviceTopics, device: &D
 /// gone before Home Assistant has let go of its entity. Home Assistant passes over it for most, and warns of it where there are names or moments: of enumerations, of a climate's
 /// modes, of timestamps.
 const NOTHING_IS_NONE: &str = "{{ value or none }}";
-
-/// The key of the entity that counts the writes to the device's EEPROM, and the info's too.
-const EEPROM_WRITES: &str = "eeprom_writes";
 
 fn eeprom_writes(identity: &str, own: &DeviceTopics, device: &DeviceSettings) -> Map<String, Value> {
     let component = json!({

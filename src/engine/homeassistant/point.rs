@@ -5,8 +5,9 @@ use super::entity::Entity;
 use super::thing;
 use crate::engine::codec::{self, Limits, Resolved};
 use crate::engine::device::{
-    Category, Device, Encoding, Form, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
+    Category, Device, Form, Kind, Names, Platform, Point, PointIndex, Poll, WriteRule,
 };
+use crate::engine::keys;
 use crate::engine::units;
 use crate::engine::value::Missing;
 
@@ -20,12 +21,10 @@ pub fn entity(device: &Device, point: PointIndex, known: &[Option<i128>]) -> Opt
     if resolved.form.elements > 1 {
         return None;
     }
-    let platforms = units::platforms(point, resolved.form);
-    let platform = point.presentation.platform.filter(|wished| platforms.contains(wished));
-    let platform = platform.unwrap_or(platforms[0]);
+    let platform = keys::platform(point, resolved.form);
     let presentation = &point.presentation;
     let name = presentation.title(&point.name);
-    let key = format!("{}{}", key(point, &resolved), shown.key_ending());
+    let key = keys::of_point(point, resolved.form, resolved.unit.as_deref()) + shown.key_ending();
     let mut entity = Entity {
         category: category(point, platform),
         icon: presentation.icon.clone().filter(|icon| icon.starts_with("mdi:")),
@@ -184,46 +183,11 @@ pub(super) fn category(point: &Point, platform: Platform) -> Option<Category> {
     if reads_only { category.map(|_| Category::Diagnostic) } else { category }
 }
 
-fn key(point: &Point, resolved: &Resolved) -> String {
-    if !matches!(point.encoding, Encoding::Cases { .. }) {
-        return point.name.clone();
-    }
-    // One key never stands for two platforms: Home Assistant would keep both entities.
-    let ending = match &resolved.unit {
-        Some(unit) => slug(unit),
-        None if resolved.form.kind == Kind::Bool => "flag".into(),
-        None if resolved.form.kind.is_text() => "text".into(),
-        None if matches!(resolved.form.names, Names::All(_)) => "state".into(),
-        None if resolved.form.since.is_some() => "time".into(),
-        None => return point.name.clone(),
-    };
-    format!("{}_{ending}", point.name)
-}
-
-/// A unit or a name as the end of an identifier: `°C` is `c`, `kΩ` is `kohm`, `m³/h` is `m3_h`.
-pub(super) fn slug(text: &str) -> String {
-    let mut slug = String::new();
-    for c in units::normalized(text).chars() {
-        match c {
-            '°' => {}
-            'Ω' | '\u{2126}' => slug.push_str("ohm"),
-            '%' => slug.push_str("percent"),
-            '\u{3bc}' => slug.push('u'),
-            '²' => slug.push('2'),
-            '³' => slug.push('3'),
-            c if c.is_ascii_alphanumeric() => slug.push(c.to_ascii_lowercase()),
-            _ if slug.is_empty() || slug.ends_with('_') => {}
-            _ => slug.push('_'),
-        }
-    }
-    slug.trim_end_matches('_').to_string()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::engine::address::{Address, Span, Table};
-    use crate::engine::device::{Decimals, Unit, Write};
+    use crate::engine::device::{Decimals, Encoding, Unit, Write};
     use crate::engine::homeassistant::beside::companions;
     use crate::engine::test_device::device_of;
     use crate::engine::time::Date;
@@ -446,23 +410,5 @@ mod tests {
             &["sensor flow_value: device_class=humidity unit_of_measurement=% state_class=measurement \
                suggested_display_precision=0"],
         );
-    }
-
-    #[test]
-    fn units_end_identifiers_in_plain_letters() {
-        for (unit, ending) in [
-            ("°C", "c"),
-            ("°F", "f"),
-            ("V", "v"),
-            ("mA", "ma"),
-            ("Ω", "ohm"),
-            ("kΩ", "kohm"),
-            ("%", "percent"),
-            ("m³/h", "m3_h"),
-            ("\u{b5}S/cm", "us_cm"),
-            ("4..20 mA", "4_20_ma"),
-        ] {
-            assert_eq!(slug(unit), ending, "{unit}");
-        }
     }
 }

@@ -1,6 +1,6 @@
 //! Announcements as Home Assistant is told them, and what they become.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
 
@@ -8,6 +8,7 @@ use super::{Announcement, Gateway, Outline, announce_bridge, announce_bus, annou
 use crate::engine::address::{Address, Span, Table};
 use crate::engine::configuration;
 use crate::engine::device::{Case, Encoding, Form, Kind, Names, Point, Poll, Unit, Write, WriteRule};
+use crate::engine::keys;
 use crate::engine::profile::Library;
 use crate::engine::settings::DeviceSettings;
 use crate::engine::test_device::device_of;
@@ -318,4 +319,29 @@ fn the_device_hangs_on_its_bus_and_the_bus_on_the_gateway() {
     assert_eq!(bus["device"]["via_device"], bridge["device"]["identifiers"][0]);
     assert_eq!(bridge["availability"], Value::Null);
     assert_eq!(bridge["components"]["connection"]["state_topic"], "busker/bridge/state");
+}
+
+/// The keys that shipped devices are told by, in any of the modes that their selectors' names make one by one.
+#[test]
+fn every_key_that_is_announced_is_among_those_that_are_held_against_others() {
+    let library = Library::shipped();
+    for id in library.ids() {
+        let inner = std::sync::Arc::new(library.load(id).expect("a shipped profile"));
+        let known_keys = keys::of_device(&inner);
+        let device = DeviceSettings { device: inner.clone(), ..device() };
+        let first = |point: &Point| point.deciding_values().first().map(|(value, _)| *value);
+        let usual: Vec<Option<i128>> = inner.points.iter().map(first).collect();
+        for (index, point) in inner.points.iter().enumerate() {
+            for (value, _) in point.deciding_values() {
+                let mut known = usual.clone();
+                known[index] = Some(value);
+                for (key, _) in announcement(&gateway(), &device, "cellar", &known).components() {
+                    assert!(known_keys.contains_key(key), "{id}: {key} with {} at {value}", point.name);
+                }
+            }
+        }
+    }
+    let bus = announce_bus(&gateway(), "cellar");
+    let own: BTreeSet<&str> = bus.components().map(|(key, _)| key).collect();
+    assert_eq!(own, keys::OF_A_WIRE.into_iter().chain([keys::LINK]).collect());
 }

@@ -9,6 +9,7 @@ use serde_json::{Map, Value, json};
 use super::device::name_beside;
 use crate::engine::codec;
 use crate::engine::device::{Device, PRESS, Point, PointIndex, Thing, ThingKind};
+use crate::engine::keys::STATE_ENDING;
 use crate::engine::settings::DeviceSettings;
 use crate::engine::topics::DeviceTopics;
 use crate::engine::value::Decimal;
@@ -53,7 +54,7 @@ pub(super) fn as_shown<'d>(
         }
         shown.point.to_mut().write = None;
         if !thing.when.is_empty() && thing.when != point.when {
-            shown.key_ending = "_state";
+            shown.key_ending = STATE_ENDING;
         }
     }
     Some(shown)

@@ -15,6 +15,7 @@ mod text;
 mod things;
 
 pub use library::Library;
+pub use text::NAME_BYTES_MAX;
 
 use std::sync::Arc;
 

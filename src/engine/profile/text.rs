@@ -61,6 +61,10 @@ choices! { "a quirk", Quirk {
     "exception_function_varies" => Quirk::ExceptionFunctionVaries,
 } }
 
+/// Names become files, topics and Home Assistant's identifiers, which end at 255 characters: that of a device, and
+/// those of a group, a point and a flag.
+pub const NAME_BYTES_MAX: usize = 48;
+
 /// A name in snake_case: of a point, a group or a flag.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Name(pub String);
@@ -70,13 +74,16 @@ impl Scalar for Name {
 
     fn parse(text: &str) -> Result<Name, String> {
         if is_name(text) {
-            return Ok(Name(text.into()));
+            return match text.len() {
+                0..=NAME_BYTES_MAX => Ok(Name(text.into())),
+                long => Err(format!("a name of {long} characters; expected at most {NAME_BYTES_MAX}")),
+            };
         }
         Err(format!("`{text}` is not a name; expected a small letter, then small letters, digits and `_`"))
     }
 
     fn schema() -> Json {
-        json!({"type": "string", "pattern": "^[a-z][a-z0-9_]*$"})
+        json!({"type": "string", "pattern": "^[a-z][a-z0-9_]*$", "maxLength": NAME_BYTES_MAX})
     }
 }
 

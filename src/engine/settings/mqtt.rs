@@ -113,9 +113,15 @@ impl Default for Layout {
     }
 }
 
+/// What is longer than a kilobyte is no topic of the gateway's.
+const LAYOUT_BYTES_MAX: usize = 255;
+
 impl Layout {
     /// Reads `{base}/{bus}/{device}/{point}`; an error says why it cannot be a layout.
     pub fn parse(text: &str) -> Result<Layout, String> {
+        if text.len() > LAYOUT_BYTES_MAX {
+            return Err(format!("it has {} bytes; expected at most {LAYOUT_BYTES_MAX}", text.len()));
+        }
         let texts: Vec<&str> = text.split('/').collect();
         let inner = match texts[..] {
             ["{base}", ref inner @ .., "{point}"] => inner,

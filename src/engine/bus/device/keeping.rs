@@ -1,5 +1,7 @@
 //! What a device keeps for its owner: settings as they are wanted, and what outlives a restart.
 
+use std::collections::BTreeSet;
+
 use crate::engine::command::Outcome;
 use crate::engine::device::PointIndex;
 use crate::engine::memory::{self, Memories, Memory, Record};
@@ -44,7 +46,7 @@ impl Keeping {
 
 impl DeviceState {
     /// Goes on from what is remembered of the device; returns how often its EEPROM has been written.
-    pub(in crate::engine::bus) fn recall(&mut self, memories: &Memories) -> u64 {
+    pub(in crate::engine::bus) fn recall(&mut self, now: Time, memories: &Memories) -> u64 {
         let device = &self.settings.device;
         // Whatever is measured later: what is refused is remembered for the plan that any start makes.
         let reads = plan::plan(device, self.tariff.cost(plan::USUAL_TURNAROUND), &[]);
@@ -52,7 +54,8 @@ impl DeviceState {
         self.keeping.plan = memory::fingerprint(device, &reads);
         self.counters.persistent_writes = memory.persistent_writes;
         if let Some(spent) = memory.writes_spent {
-            self.wear.recall(spent);
+            let points = memory.written_lately.iter().filter_map(|name| device.point_named(name));
+            self.wear.recall(now, spent, points);
         }
         // Another profile asks otherwise, and is refused otherwise.
         if memory.plan == self.keeping.plan {
@@ -84,15 +87,24 @@ impl DeviceState {
             refused: self.refused.clone(),
             persistent_writes: self.counters.persistent_writes,
             writes_spent: (self.counters.persistent_writes > 0).then(|| self.wear.writes_spent(now)),
+            written_lately: self.written_lately(now),
             section: self.upkeep.section().clone(),
             settled: self.upkeep.settled(),
         }
     }
 
+    /// The points that must not be written yet, since they have been.
+    fn written_lately(&self, now: Time) -> BTreeSet<String> {
+        let points = self.settings.device.points.iter().enumerate();
+        let spared = points.filter(|(index, _)| now < self.wear.allowed_at(*index));
+        spared.map(|(_, point)| point.name.clone()).collect()
+    }
+
     /// What is to be stored now; `at_once` at the end, when there is no later.
     pub(in crate::engine::bus) fn record(&mut self, now: Time, at_once: bool) -> Option<Record> {
-        if !self.keeping.changed || (now < self.keeping.not_before && !at_once) {
-            return None;
+        match self.record_due_at() {
+            Some(due) if now >= due || at_once => {}
+            _ => return None,
         }
         self.keeping.changed = false;
         let memory = self.memory(now);
@@ -105,7 +117,12 @@ impl DeviceState {
     }
 
     pub(in crate::engine::bus) fn record_due_at(&self) -> Option<Time> {
-        self.keeping.changed.then_some(self.keeping.not_before)
+        let changed = self.keeping.changed.then_some(self.keeping.not_before);
+        // A start long after it shall spare nothing.
+        let written = self.keeping.stored.written_lately.iter();
+        let points = written.filter_map(|name| self.settings.device.point_named(name));
+        let lapsed = points.map(|point| self.wear.allowed_at(point)).max();
+        changed.into_iter().chain(lapsed.map(|at| at.max(self.keeping.not_before))).min()
     }
 
     /// Compares the settings with what the device holds. Whether what is told of them has changed.

@@ -46,9 +46,11 @@ impl Wear {
     }
 
     /// Goes on with so many writes taken out of the budget, after a restart. (What is left would not do: the
-    /// budget may be another one by then.)
-    pub(super) fn recall(&mut self, writes_spent: u32) {
+    /// budget may be another one by then.) When the points were written lately nobody knows any more: at most now.
+    pub(super) fn recall(&mut self, now: Time, writes_spent: u32, lately: impl Iterator<Item = PointIndex>) {
         self.account.left = Wear::full(self.rules).saturating_sub(u64::from(writes_spent) * WRITE);
+        self.account.left_at = now;
+        self.account.written_at = lately.map(|point| (point, now)).collect();
     }
 
     /// Goes on by other rules. What was written stays written.
@@ -163,7 +165,7 @@ mod tests {
         // Half of the budget at once, and the other half as it comes in.
         assert_eq!(writes_in(24, 20, &mut Wear::new(RULES)), 200 - 1);
         let mut wear = Wear::new(RULES);
-        wear.recall(100 - 3);
+        wear.recall(Time::default(), 100 - 3, [].into_iter());
         let writes = writes_in(1, 20, &mut wear);
         assert_eq!(writes, 3 + 100 / 24);
         let now = Time::from_millis(3_600_000);
@@ -182,7 +184,7 @@ mod tests {
             }
             assert!(few.spent(Time::default()).is_some(), "half of 8 are written");
             let mut changed = Wear::new(Eeprom { daily, ..RULES });
-            changed.recall(few.writes_spent(Time::default()));
+            changed.recall(Time::default(), few.writes_spent(Time::default()), [].into_iter());
             let mut writes = 0;
             while changed.spent(Time::default()).is_none() {
                 changed.spend(Time::default(), writes);
@@ -191,6 +193,15 @@ mod tests {
             writes
         };
         assert_eq!([8, 500, 20, 4].map(writes_at_once), [0, 246, 6, 0]);
+    }
+
+    #[test]
+    fn what_begins_anew_late_has_no_more_left_for_that_and_spares_the_same_points() {
+        let now = Time::from_millis(30 * 24 * 3_600_000);
+        let mut wear = Wear::new(RULES);
+        wear.recall(now, 100, [3].into_iter());
+        assert!(wear.spent(now).is_some());
+        assert_eq!([3, 4].map(|point| wear.allowed_at(point)), [now + RULES.interval, Time::default()]);
     }
 
     #[test]

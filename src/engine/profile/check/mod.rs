@@ -11,14 +11,16 @@ mod things;
 mod writing;
 
 use crate::engine::device::{Device, Form, Point};
+use crate::engine::keys::{self, EEPROM_WRITES, Owner, WIRE};
 use crate::engine::profile::expand::Expanded;
 use crate::engine::profile::file::{self, Profile};
-use crate::engine::yaml::{At, Faults};
+use crate::engine::yaml::{At, Faults, Place};
 
 /// Notes every rule that `device`, made of `points` of `profile`, breaks.
 pub fn check(profile: &Profile, points: &[Expanded<'_>], device: &Device, faults: &mut Faults) {
     let mut rules = Rules { profile, points, device, faults };
     rules.names_are_unique_and_free();
+    rules.entities_have_keys_of_their_own();
     rules.what_is_read_has_a_poll_class();
     rules.limits_are_possible();
     rules.places();
@@ -75,6 +77,27 @@ impl<'a, 'f> Rules<'a, 'f> {
                 let name = &point.name;
                 self.faults.add(point.place, format!("`{name}` {why}; expected another name for this point"));
             }
+        }
+    }
+
+    fn entities_have_keys_of_their_own(&mut self) {
+        for (key, owners) in keys::shared(self.device) {
+            let place = owners.iter().rev().find_map(|owner| self.place_of(owner));
+            self.faults.add(place.unwrap_or(&self.profile.place), keys::message(&key, &owners));
+        }
+    }
+
+    fn place_of(&self, owner: &Owner) -> Option<&'f Place> {
+        match owner {
+            Owner::Point(name) | Owner::Commanded(name) | Owner::Button { point: name, .. } => {
+                self.points.iter().find(|point| point.name == *name).map(|point| point.place)
+            }
+            Owner::Thing(index, _) => {
+                let thing = &self.device.things[*index];
+                let paths = self.profile.things.iter().filter(|(path, _)| things::is_at(thing, &path.value));
+                paths.last().map(|(path, _)| &path.place)
+            }
+            Owner::Gateway => None,
         }
     }
 
@@ -136,10 +159,8 @@ fn is_true(key: &Option<At<bool>>) -> bool {
 fn taken_by_the_gateway(name: &str) -> Option<&'static str> {
     match name {
         "availability" | "info" | "health" => Some("is a topic of every device"),
-        "eeprom_writes" => Some("is the entity that counts what is written to the device's EEPROM"),
-        _ if name.starts_with("wire_") => {
-            Some("begins as entities do that tell how the device is on its wire")
-        }
+        EEPROM_WRITES => Some("is the entity that counts what is written to the device's EEPROM"),
+        _ if name.starts_with(WIRE) => Some("begins as entities do that tell how the device is on its wire"),
         _ => None,
     }
 }

@@ -99,7 +99,7 @@ impl<'a, 'f> Rules<'a, 'f> {
 }
 
 /// Whether `thing` is what became of the entry at `path`.
-fn is_at(thing: &Thing, path: &PointPath) -> bool {
+pub(super) fn is_at(thing: &Thing, path: &PointPath) -> bool {
     let Some((group, own)) = path.0.split_once('.') else { return thing.name == path.0 };
     let inside = thing.name.strip_prefix(group).and_then(|rest| rest.strip_suffix(own));
     let number = inside.and_then(|inside| inside.strip_prefix('_')?.strip_suffix('_'));
