@@ -423,5 +423,6 @@ fn of_every_shipped_device_the_second_places_are_chosen_best() {
             }
         }
     }
-    assert!(looked_at >= 10 * 9 + 1, "{looked_at}");
+    // Of all devices that have any, two are too large for most settings.
+    assert!(looked_at > 10 * 9, "{looked_at}");
 }
