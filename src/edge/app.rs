@@ -44,7 +44,6 @@ pub struct App {
 }
 
 /// What the settings name and does not stand in them. It may change while they do not.
-#[derive(Clone, PartialEq, Eq)]
 pub(super) struct Keys {
     password: Option<String>,
     pub(super) token: Option<String>,
@@ -58,9 +57,9 @@ impl Keys {
         })
     }
 
-    /// Whether the broker would find no difference.
-    pub(super) fn is_same_broker(&self, other: &Keys) -> bool {
-        self.password == other.password
+    /// What of them is another than before.
+    pub(super) fn differ_from(&self, before: &Keys) -> reload::Secrets {
+        reload::Secrets { password: self.password != before.password, token: self.token != before.token }
     }
 }
 
@@ -80,9 +79,8 @@ impl App {
         let plant = Arc::new(Plant::new(settings, library, clock));
         recall(&plant, &state.now());
         introduce(&plant.settings(), &plant.mailbox());
-        let everyone = 0..plant.settings().buses.len();
-        let threads = Threads::new(plant.stir().clone());
-        let buses = start_buses(&threads, &plant, everyone, clock, &state)?;
+        let threads = Threads::new(clock, state.clone(), plant.stir().clone());
+        let buses = start_buses(&threads, &plant)?;
         plant.set_buses(buses.clone());
 
         let _inside = runtime.enter();
@@ -162,18 +160,12 @@ pub(super) fn introduce(settings: &Settings, mailbox: &Mailbox) {
     homeassistant::introduction(settings).into_iter().for_each(|message| mailbox.push(message));
 }
 
-/// Starts the buses of these numbers of the plant's settings. An error means that none of them runs.
-pub(super) fn start_buses(
-    threads: &Threads,
-    plant: &Plant,
-    which: impl IntoIterator<Item = usize>,
-    clock: Clock,
-    state: &Arc<Shelf>,
-) -> anyhow::Result<Vec<Arc<BusHandle>>> {
+/// Starts the plant's buses. An error means that none of them runs.
+fn start_buses(threads: &Threads, plant: &Plant) -> anyhow::Result<Vec<Arc<BusHandle>>> {
     let settings = plant.settings();
     let mut buses: Vec<Arc<BusHandle>> = Vec::new();
-    for index in which {
-        match start_bus(threads, &settings, index, clock, state, plant.mailbox()) {
+    for index in 0..settings.buses.len() {
+        match start_bus(threads, &settings, index, plant.mailbox()) {
             Ok(handle) => buses.push(handle),
             Err(error) => {
                 buses.iter().for_each(|bus| bus.shutdown());
@@ -185,16 +177,14 @@ pub(super) fn start_buses(
     Ok(buses)
 }
 
+/// Starts the bus number `index` of the settings, which tells what it has to tell through `mailbox`.
 pub(super) fn start_bus(
     threads: &Threads,
     settings: &Arc<Settings>,
     index: usize,
-    clock: Clock,
-    state: &Arc<Shelf>,
     mailbox: Arc<Mailbox>,
 ) -> anyhow::Result<Arc<BusHandle>> {
-    let publish = Box::new(move |message| mailbox.push(message));
-    let started = threads.start(settings.clone(), index, clock, state.clone(), publish);
+    let started = threads.start(settings.clone(), index, Box::new(move |message| mailbox.push(message)));
     let name = &settings.buses[index].name;
     started.map(Arc::new).with_context(|| format!("bus {name} cannot be started"))
 }

@@ -11,10 +11,11 @@ use crate::edge::bell::Bell;
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
 use crate::edge::link::{Link, Lost};
+use crate::edge::log;
 use crate::edge::recordings;
 use crate::edge::state_files::Shelf;
 use crate::edge::stir::Stir;
-use crate::engine::bus::{Action, Bus, Event, Inbox, STOPPING, Severity};
+use crate::engine::bus::{Action, Bus, Event, Inbox, STOPPING};
 use crate::engine::health::BusReport;
 use crate::engine::modbus::Reply;
 use crate::engine::modbus::guard::Guard;
@@ -240,10 +241,7 @@ impl BusRunner {
                     self.stir.stir();
                 }
                 Action::Say(severity, text) => {
-                    match severity {
-                        Severity::Info => tracing::info!("{text}"),
-                        Severity::Warning => tracing::warn!("{text}"),
-                    }
+                    log::say(severity, &text);
                     self.stir.stir();
                 }
             }

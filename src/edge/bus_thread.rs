@@ -86,25 +86,26 @@ impl BusHandle {
 }
 
 /// The threads of a gateway's buses. After it is dropped each ends with its last bus.
-#[derive(Default)]
 pub struct Threads {
+    /// The one that all Modbus TCP connections share.
     shared: Mutex<Option<Arc<Shared>>>,
+    clock: Clock,
+    state: Arc<Shelf>,
     stir: Arc<Stir>,
 }
 
 impl Threads {
     /// The threads stir when anything happens but that devices answer as they should.
-    pub fn new(stir: Arc<Stir>) -> Threads {
-        Threads { shared: Mutex::default(), stir }
+    pub fn new(clock: Clock, state: Arc<Shelf>, stir: Arc<Stir>) -> Threads {
+        Threads { shared: Mutex::default(), clock, state, stir }
     }
 
-    /// Starts the bus number `index`. `publish` is called on its thread and must not wait.
+    /// Starts the bus number `index` of the settings, which goes on from what is kept in the state. `publish` is called
+    /// on its thread and must not wait.
     pub fn start(
         &self,
         settings: Arc<Settings>,
         index: usize,
-        clock: Clock,
-        state: Arc<Shelf>,
         publish: Box<dyn Fn(Message) + Send>,
     ) -> std::io::Result<BusHandle> {
         let inbox = Arc::<Mutex<Inbox>>::default();
@@ -112,7 +113,7 @@ impl Threads {
         let (ended, end) = sync_channel(1);
         let stop = Arc::new(AtomicBool::new(false));
         let shares = matches!(settings.buses[index].link, Link::Tcp { .. });
-        let shared = if shares { Some(self.shared(clock)?) } else { None };
+        let shared = if shares { Some(self.shared()?) } else { None };
         let bell = match &shared {
             Some(shared) => shared.bell.clone(),
             None => Bell::new()?,
@@ -127,7 +128,7 @@ impl Threads {
         };
         let name = format!("bus-{}", settings.buses[index].name);
         // Not on the thread: what lives long lies better beside what lives long.
-        let runner = BusRunner::new(settings, index, clock, state, publish, ears);
+        let runner = BusRunner::new(settings, index, self.clock, self.state.clone(), publish, ears);
         let first = runner.summary();
         match shared {
             Some(shared) => {
@@ -142,7 +143,7 @@ impl Threads {
     }
 
     /// The thread for connections, which begins with the first of them.
-    fn shared(&self, clock: Clock) -> std::io::Result<Arc<Shared>> {
+    fn shared(&self) -> std::io::Result<Arc<Shared>> {
         let mut shared = lock(&self.shared);
         if let Some(shared) = &*shared {
             return Ok(shared.clone());
@@ -154,9 +155,14 @@ impl Threads {
         });
         let epoll = epoll::create(epoll::CreateFlags::CLOEXEC)?;
         epoll::add(&epoll, &new.bell, epoll::EventData::new_u64(BELL), epoll::EventFlags::IN)?;
-        let (shared_with, runners) = (new.clone(), Vec::new());
-        let thread =
-            SharedThread { shared: shared_with, epoll, clock, runners, next_number: 0, wake_at: None };
+        let thread = SharedThread {
+            shared: new.clone(),
+            epoll,
+            clock: self.clock,
+            runners: Vec::new(),
+            next_number: 0,
+            wake_at: None,
+        };
         std::thread::Builder::new().name("connections".into()).spawn(move || thread.run())?;
         *shared = Some(new.clone());
         Ok(new)

@@ -39,19 +39,20 @@ fn line() -> (OwnedFd, String) {
     (far, path)
 }
 
-fn nowhere() -> Arc<Shelf> {
-    Arc::new(Shelf::new(StateFiles::nowhere()))
+/// Threads that stir `stir` and keep nothing.
+fn threads(stir: Arc<Stir>) -> Threads {
+    Threads::new(Clock::start(), Arc::new(Shelf::new(StateFiles::nowhere())), stir)
 }
 
 fn run(settings: Arc<Settings>) -> (BusHandle, Receiver<Message>) {
-    run_with(&Threads::default(), settings)
+    run_with(&threads(Arc::default()), settings)
 }
 
 fn run_with(threads: &Threads, settings: Arc<Settings>) -> (BusHandle, Receiver<Message>) {
     let (sender, messages) = channel();
     // The test may have heard enough.
     let publish = move |message| drop(sender.send(message));
-    let bus = threads.start(settings, 0, Clock::start(), nowhere(), Box::new(publish)).expect("a thread");
+    let bus = threads.start(settings, 0, Box::new(publish)).expect("a thread");
     (bus, messages)
 }
 
@@ -137,9 +138,8 @@ fn what_does_not_fit_into_the_inbox_is_refused_and_not_waited_for() {
     let publish = move |_| {
         let _ = hold.lock().expect("one thread").recv();
     };
-    let bus = Threads::default()
-        .start(settings("/dev/no-such", "1s"), 0, Clock::start(), nowhere(), Box::new(publish))
-        .expect("a thread");
+    let threads = threads(Arc::default());
+    let bus = threads.start(settings("/dev/no-such", "1s"), 0, Box::new(publish)).expect("a thread");
     let get = || Event::Get { device: "thermometer".into(), point: "temperature".into() };
     let taken = (0..=Inbox::LIMIT).filter(|_| bus.send(get()).is_ok()).count();
     assert_eq!(taken, Inbox::LIMIT);
@@ -181,7 +181,7 @@ fn connections_share_a_thread_and_end_one_by_one() {
     let text = text + &devices;
     let loaded = configuration::load("busker.yaml", text.as_bytes(), &Library::shipped());
     let settings = Arc::new(loaded.expect("a good configuration").0);
-    let threads = Threads::default();
+    let threads = threads(Arc::default());
     let mut buses = Vec::new();
     let (told_on, thread_of) = channel();
     for index in 0..3 {
@@ -191,9 +191,7 @@ fn connections_share_a_thread_and_end_one_by_one() {
             let _ = told_on.send(std::thread::current().id());
             drop(sender.send(message));
         };
-        let bus = threads
-            .start(settings.clone(), index, Clock::start(), nowhere(), Box::new(publish))
-            .expect("a thread");
+        let bus = threads.start(settings.clone(), index, Box::new(publish)).expect("a thread");
         buses.push((bus, messages));
     }
     for (name, (_, messages)) in ["one", "two", "three"].iter().zip(&buses) {
@@ -225,7 +223,7 @@ fn a_bus_is_stirred_by_what_happens_to_devices_and_not_by_what_they_tell() {
     let (far, path) = line();
     let stir = Arc::<Stir>::default();
     let is_stirred = || pin!(stir.stirred()).poll(&mut Context::from_waker(Waker::noop())).is_ready();
-    let (bus, messages) = run_with(&Threads::new(stir.clone()), settings(&path, "30s"));
+    let (bus, messages) = run_with(&threads(stir.clone()), settings(&path, "30s"));
     hear_request(&far);
     answer(&far, 21);
     wait_for(&messages, "busker/one/availability", "online");

@@ -11,6 +11,7 @@ pub mod guarded_link;
 pub mod http;
 pub mod link;
 pub mod lock;
+pub mod log;
 pub mod metrics;
 pub mod mqtt;
 pub mod plant;

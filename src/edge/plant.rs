@@ -113,41 +113,15 @@ impl Plant {
         match news {
             News::Up => parts.tell_all(&Event::BrokerUp),
             News::Down => parts.tell_all(&Event::BrokerDown),
-            News::Get { device, point } => {
-                // Who finds no room reads at the next poll.
-                match parts.desk.bus_of(&device) {
-                    Some(bus) => drop(parts.hand_over(bus, Event::Get { device, point })),
-                    None => tracing::debug!("a message for `{device}`, which is no device of this gateway"),
-                }
-            }
-            News::Request { verb, payload, retained, stale } => {
-                let decision = match stale {
-                    Some(reason) if !retained => parts.desk.refuse(&verb, &payload, &reason),
-                    _ => parts.desk.take(self.clock.today(), &verb, &payload, retained),
-                };
+            News::Errand(errand) => {
+                let decision = parts.desk.decide(self.clock.today(), errand);
                 parts.carry_out(decision);
-            }
-            News::Set { device, point, payload, retained } => {
-                parts.command(Command { device, point, payload, retained });
             }
         }
     }
 }
 
 impl Parts {
-    fn command(&self, command: Command) {
-        let Command { device, point, payload, retained } = &command;
-        match self.desk.bus_of_set(device, point, payload, *retained) {
-            Ok(bus) => {
-                let taken = self.hand_over(bus, Event::Command(command.clone()));
-                if let Some(outcome) = ended_at_once(&command, &taken) {
-                    self.mailbox.push(self.desk.outcome(device, point, &outcome));
-                }
-            }
-            Err(decision) => self.carry_out(decision),
-        }
-    }
-
     fn carry_out(&self, decision: Decision) {
         match decision {
             Decision::Ask(bus, request) => {
@@ -155,8 +129,17 @@ impl Parts {
                     self.mailbox.push(self.desk.no_room(&request));
                 }
             }
+            Decision::Obey(bus, command) => {
+                let taken = self.hand_over(bus, Event::Command(command.clone()));
+                if let Some(outcome) = ended_at_once(&command, &taken) {
+                    self.mailbox.push(self.desk.outcome(&command.device, &command.point, &outcome));
+                }
+            }
+            // Who finds no room reads at the next poll.
+            Decision::Read { bus, device, point } => drop(self.hand_over(bus, Event::Get { device, point })),
             Decision::Answer(message) => self.mailbox.push(message),
             Decision::Warn(text) => tracing::warn!("{text}"),
+            Decision::Mention(text) => tracing::debug!("{text}"),
             Decision::Ignore => {}
         }
     }

@@ -1,7 +1,9 @@
 //! A new configuration while the gateway runs: only what has changed ends, begins or begins anew.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
+
+use anyhow::Context;
 
 use crate::edge::app::{
     App, BUSES_END_WITHIN, Keys, connect, end_buses, introduce, remember_topics, start_bus, watch, watched,
@@ -17,10 +19,9 @@ use crate::engine::bus::{self, Bus, Event};
 use crate::engine::homeassistant;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
-use crate::engine::reload::{self, Change, Fate, Telling};
-use crate::engine::settings::{DeviceSettings, Settings};
+use crate::engine::reload::{self, Change, Telling};
+use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
-use crate::engine::topics::Topics;
 
 /// How often a bus is asked whether a device has left it.
 const ASK_EVERY: Duration = Duration::from_millis(5);
@@ -32,34 +33,31 @@ impl App {
         // What can fail comes before what cannot.
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
         let old = self.plant.settings();
-        let mut change = reload::compare(&old, &settings);
+        let mut change = reload::compare(&old, &settings, keys.differ_from(&self.keys));
         let port = self.http_address().map(|address| address.port());
         let listener = match reload::listens_before_leaving(&old, &settings, port) {
             Some(listen) => Some(self.runtime.block_on(Http::bind(listen))?),
             None => None,
         };
-        let names = || settings.devices.iter().map(|device| device.name.as_str());
-        let state = match old.state_dir == settings.state_dir {
-            true => None,
-            false => Some(StateFiles::open(&settings.state_dir, names())?),
-        };
-        let is_kept = |state: &StateFiles| state.memories().unkept.is_none();
-        if state.as_ref().is_some_and(|state| !is_kept(state) || !is_kept(&self.state.now())) {
-            change.every_device_begins_anew(&old, &settings);
+        let mut state = None;
+        if change.memory {
+            let names = settings.devices.iter().map(|device| device.name.as_str());
+            let opened = StateFiles::open(&settings.state_dir, names)?;
+            let before = self.state.now();
+            change.remember_elsewhere((&old, &before.memories()), (&settings, &opened.memories()));
+            state = Some(opened);
         }
         // One that could not come back is tried again, whatever has changed.
-        let http_is_missing = self.http.is_none() && settings.http.listen.is_some();
-        let http_ends = change.http || keys.token != self.keys.token || http_is_missing;
-        if change.is_nothing() && keys == self.keys {
+        change.http |= self.http.is_none() && settings.http.listen.is_some();
+        if change.is_nothing() {
             tracing::info!("the new configuration changes nothing that runs");
         }
-        if http_ends {
+        if change.http {
             self.exchange_http(listener, &old, &settings, keys.token.clone())?;
         }
         self.exchange(&old, settings, library, state, &change)?;
-        let reconnects = change.broker || !keys.is_same_broker(&self.keys);
         self.keys = keys;
-        if reconnects {
+        if change.broker {
             tracing::info!("the connection to the broker is made anew");
             self.reconnect(secrets);
         }
@@ -74,6 +72,8 @@ impl App {
         self.plant.stir().stir();
     }
 
+    /// Goes through the change in the order that [`reload`] wants: what ends ends before anything begins. `state` is
+    /// where things are remembered from now on, if that is another place.
     fn exchange(
         &mut self,
         old: &Settings,
@@ -83,76 +83,65 @@ impl App {
         change: &Change,
     ) -> anyhow::Result<()> {
         let before = old.buses.iter().map(|bus| bus.name.clone()).zip(self.plant.buses());
-        let mut running: BTreeMap<String, Arc<BusHandle>> = before.collect();
+        let (staying, ending): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            before.partition(|(bus, _)| change.stays(bus));
         let _change = Reporter::change(&self.reporter);
         // Nobody asks a bus that is about to end, and takes its silence for a fault.
         self.reporter.keep(|bus| change.stays(bus));
-        let ending: Vec<String> = running.keys().filter(|name| !change.stays(name)).cloned().collect();
-        let ended = ending.iter().filter_map(|name| running.remove(name)).collect();
-        end_buses(&self.runtime, ended);
-        for (name, fate) in &change.buses {
-            if let (Fate::Stays { leave, .. }, Some(bus)) = (fate, running.get(name)) {
-                self.retire(bus, leave);
-            }
+        end_buses(&self.runtime, ending.into_values().collect());
+        for (name, bus) in &staying {
+            self.retire(bus, change.leaving(name));
         }
         if let Some(state) = state {
             self.state.exchange(state);
         }
         if change.telling != Telling::AsBefore {
-            self.tell_otherwise(old, &settings, change.telling, running.values());
+            self.tell_otherwise(old, &settings, change.telling, staying.values());
         }
-        self.take_back(old, &settings, change.telling);
-
-        // What was on other buses may come to a bus only now that it has left those.
-        let settings_of_threads = Arc::new(settings.clone());
-        let names = settings.devices.iter().map(|device| device.name.as_str());
-        let memories = self.state.now().learn(names);
-        let is_connected = self.plant.broker().connected;
-        let mut buses = Vec::new();
-        for (index, (name, fate)) in change.buses.iter().enumerate() {
-            let bus = match (fate, running.remove(name)) {
-                (Fate::Stays { come, .. }, Some(bus)) => {
-                    if let Some(rules) = change.rules {
-                        self.hand_over(&bus, Event::Rules(rules));
-                    }
-                    if !come.is_empty() {
-                        let devices = on_bus(come, index);
-                        self.hand_over(&bus, Event::Adopt(devices, memories.clone()));
-                    }
-                    bus
-                }
-                _ => {
-                    let mailbox = self.plant.mailbox();
-                    if let Some(message) = homeassistant::introduction_of_bus(&settings, name) {
-                        mailbox.push(message);
-                    }
-                    let bus = start_bus(
-                        &self.threads,
-                        &settings_of_threads,
-                        index,
-                        self.clock,
-                        &self.state,
-                        mailbox,
-                    );
-                    let bus =
-                        bus.map_err(|error| error.context("the new configuration works only in part"))?;
-                    if !is_connected {
-                        self.hand_over(&bus, Event::BrokerDown);
-                    }
-                    bus
-                }
-            };
-            buses.push(bus);
-        }
+        self.plant.mailbox().change(|outbox| reload::take_back(outbox, old, &settings, change.telling));
+        let buses = self.begin(&Arc::new(settings.clone()), change, staying)?;
         let watched = watched(&buses);
         self.plant.exchange(settings, library, buses);
         remember_topics(&self.plant, &self.state.now());
         self.reporter.replace(watched);
-        if change.telling != Telling::AsBefore || change.memory {
+        if change.begins_telling_anew() {
             self.look_anew();
         }
         change.lines().iter().for_each(|line| tracing::info!("{line}"));
         Ok(())
+    }
+
+    /// Starts what begins, and tells every bus what is new for it. Returns all buses in the order of the settings.
+    fn begin(
+        &self,
+        settings: &Arc<Settings>,
+        change: &Change,
+        mut staying: BTreeMap<String, Arc<BusHandle>>,
+    ) -> anyhow::Result<Vec<Arc<BusHandle>>> {
+        // What was on other buses may come to a bus only now that it has left those.
+        let names = settings.devices.iter().map(|device| device.name.as_str());
+        let memories = self.state.now().learn(names);
+        let is_connected = self.plant.broker().connected;
+        let mut buses = Vec::new();
+        for (index, (name, _)) in change.buses.iter().enumerate() {
+            let bus = match staying.remove(name) {
+                Some(bus) => bus,
+                None => self.begin_bus(settings, index)?,
+            };
+            for event in change.events(index, &memories, is_connected) {
+                self.hand_over(&bus, event);
+            }
+            buses.push(bus);
+        }
+        Ok(buses)
+    }
+
+    fn begin_bus(&self, settings: &Arc<Settings>, index: usize) -> anyhow::Result<Arc<BusHandle>> {
+        let mailbox = self.plant.mailbox();
+        if let Some(message) = homeassistant::introduction_of_bus(settings, &settings.buses[index].name) {
+            mailbox.push(message);
+        }
+        start_bus(&self.threads, settings, index, mailbox).context("the new configuration works only in part")
     }
 
     /// Lets the buses that stay tell what is known as the new settings want it. They lose nothing by it.
@@ -239,24 +228,6 @@ impl App {
         }
     }
 
-    /// Takes back at the broker what the new settings do not have.
-    fn take_back(&self, old: &Settings, new: &Settings, telling: Telling) {
-        let topics = Topics::of(&new.mqtt);
-        let before = match telling {
-            // Has been taken back, as far as it could be.
-            Telling::Elsewhere => BTreeSet::new(),
-            Telling::AsBefore | Telling::Otherwise => reload::topics_of_devices(old),
-        };
-        let wanted = reload::topics_of_devices(new);
-        let changed = reload::changed_devices(old, new);
-        self.plant.mailbox().change(|outbox| {
-            outbox.reconfigure(homeassistant::identities(new), &before, &wanted);
-            for device in changed {
-                outbox.announced_anew(&topics.identity(&device));
-            }
-        });
-    }
-
     fn reconnect(&mut self, secrets: Secrets) {
         if let Some(broker) = self.broker.take() {
             self.runtime.block_on(broker.finish(None));
@@ -299,8 +270,4 @@ impl App {
         }
         failed.map_or(Ok(()), Err)
     }
-}
-
-fn on_bus(devices: &[DeviceSettings], bus: usize) -> Vec<DeviceSettings> {
-    devices.iter().map(|device| DeviceSettings { bus, ..device.clone() }).collect()
 }

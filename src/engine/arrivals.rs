@@ -1,9 +1,17 @@
 //! What a message from the broker is to this gateway, and which of them it wants to have.
+//!
+//! A message is sorted once, when it arrives: what somebody wants of a bus goes straight there ([`Errand`]), and what
+//! the outbox has to know follows in its own time ([`Heard`]).
+
+mod subscriptions;
 
 use crate::engine::command::{OutcomeKind, Wish};
+use crate::engine::outbox::Heard;
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 use crate::engine::topics::{self, Incoming, Message, ONLINE, Topics};
+
+pub use subscriptions::Subscriptions;
 
 /// A message that the broker has handed on.
 #[derive(Clone, Copy, Debug)]
@@ -18,37 +26,42 @@ pub struct Mail<'m> {
     pub stale_for: Option<Duration>,
 }
 
-/// What is to be done with it.
-#[derive(Debug, PartialEq, Eq)]
-pub enum Arrival<'m> {
-    /// Somebody has told this gateway's state, itself perhaps.
-    OwnState,
-    /// Somebody may be below a base topic that this gateway had.
-    FormerState,
-    HomeAssistantStarted,
-    /// An announcement of an earlier run, of this one, or of somebody else: told just now, or kept by the broker.
-    Announcement {
-        is_news: bool,
-    },
-    Set {
-        device: &'m str,
-        point: &'m str,
-    },
-    /// A command that is too old to be obeyed, and why.
-    Expired {
-        reason: String,
-        outcome: Message,
-    },
+/// What a message is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Arrival {
+    Errand(Errand),
+    Heard(Heard),
+    /// It is of no interest, or not meant for now.
+    Nothing,
+}
+
+/// What somebody wants of a bus or of a device on it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Errand {
+    Set(Command),
+    /// To read a point now.
     Get {
-        device: &'m str,
-        point: &'m str,
+        device: String,
+        point: String,
     },
-    /// `stale` says why it would be too old to be obeyed.
+    /// A request with a verb and JSON.
     Request {
-        verb: &'m str,
+        verb: String,
+        payload: String,
+        retained: bool,
+        /// Why it would be too old to be obeyed.
         stale: Option<String>,
     },
-    Nothing,
+}
+
+/// A message on a `set` topic, as it came.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Command {
+    pub device: String,
+    pub point: String,
+    pub payload: String,
+    /// A replayed one; it is never obeyed.
+    pub retained: bool,
 }
 
 /// Where messages from the broker are sorted.
@@ -92,50 +105,65 @@ impl Arrivals {
         &self.filters
     }
 
-    pub fn sort<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
+    /// What this message is.
+    pub fn sort(&self, mail: &Mail<'_>) -> Arrival {
         match (self.sort_present(mail), &self.before) {
             (Arrival::Nothing, Some(before)) => before.sort_present(mail),
             (arrival, _) => arrival,
         }
     }
 
-    fn sort_present<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
+    fn sort_present(&self, mail: &Mail<'_>) -> Arrival {
         let is_news = !mail.retained;
         if mail.topic == self.topics.bridge_state() {
             // What the broker has kept is followed by this gateway's own word.
-            return Arrival::OwnState.only_if(is_news);
+            return Arrival::Heard(Heard::OwnState).only_if(is_news);
         }
         if self.former_states.iter().any(|state| state == mail.topic) {
-            return Arrival::FormerState;
+            return Arrival::Heard(Heard::FormerState);
         }
         if mail.topic == self.status_topic {
             // Who was there before this connection was told everything when it was made.
-            return Arrival::HomeAssistantStarted.only_if(is_news && mail.payload == ONLINE);
+            return Arrival::Heard(Heard::HomeAssistantStarted).only_if(is_news && mail.payload == ONLINE);
         }
         if mail.topic.ends_with("/config") {
-            return Arrival::Announcement { is_news };
+            return Arrival::Heard(Heard::Announcement { is_news });
         }
+        let (payload, retained) = (mail.payload, mail.retained);
         match self.topics.parse(mail.topic) {
             Some(Incoming::Set { device, point }) => match mail.too_old().filter(|_| is_news) {
-                Some(reason) => Arrival::expired(mail, reason),
-                None => Arrival::Set { device, point },
+                Some(reason) => Arrival::Heard(expired(mail, reason)),
+                None => Arrival::Errand(Errand::Set(Command {
+                    device: device.into(),
+                    point: point.into(),
+                    payload: payload.into(),
+                    retained,
+                })),
             },
-            Some(Incoming::Get { device, point }) => Arrival::Get { device, point }.only_if(is_news),
-            Some(Incoming::Request { verb }) => Arrival::Request { verb, stale: mail.too_old() },
+            Some(Incoming::Get { device, point }) => {
+                Arrival::Errand(Errand::Get { device: device.into(), point: point.into() }).only_if(is_news)
+            }
+            Some(Incoming::Request { verb }) => Arrival::Errand(Errand::Request {
+                verb: verb.into(),
+                payload: payload.into(),
+                retained,
+                stale: mail.too_old(),
+            }),
             None => Arrival::Nothing,
         }
     }
 }
 
-impl<'m> Arrival<'m> {
-    fn only_if(self, condition: bool) -> Arrival<'m> {
+impl Arrival {
+    fn only_if(self, condition: bool) -> Arrival {
         if condition { self } else { Arrival::Nothing }
     }
+}
 
-    fn expired(mail: &Mail<'m>, reason: String) -> Arrival<'m> {
-        let outcome = Wish::parse(mail.payload).ended(OutcomeKind::Expired, &reason);
-        Arrival::Expired { reason, outcome: Message::once(topics::outcome_of(mail.topic), outcome.to_json()) }
-    }
+/// A command that is too old to be obeyed, with its outcome for whoever gave it.
+fn expired(mail: &Mail<'_>, reason: String) -> Heard {
+    let outcome = Wish::parse(mail.payload).ended(OutcomeKind::Expired, &reason);
+    Heard::Expired { reason, outcome: Message::once(topics::outcome_of(mail.topic), outcome.to_json()) }
 }
 
 impl Mail<'_> {
@@ -185,7 +213,7 @@ mod tests {
         let mut arrivals = arrivals("home_assistant: {status_topic: ha/status}\n");
         let started = |arrivals: &Arrivals, topic: &str| {
             let mail = Mail { topic, payload: ONLINE, retained: false, repeated: false, stale_for: None };
-            arrivals.sort(&mail) == Arrival::HomeAssistantStarted
+            arrivals.sort(&mail) == Arrival::Heard(Heard::HomeAssistantStarted)
         };
         let both =
             |arrivals: &Arrivals| ["ha/status", "homeassistant/status"].map(|topic| started(arrivals, topic));
@@ -196,9 +224,23 @@ mod tests {
         assert_eq!(both(&arrivals), [false, true]);
     }
 
+    fn set(payload: &str, retained: bool) -> Arrival {
+        let (device, point, payload) = ("boiler".into(), "flow".into(), payload.into());
+        Arrival::Errand(Errand::Set(Command { device, point, payload, retained }))
+    }
+
+    fn get() -> Arrival {
+        Arrival::Errand(Errand::Get { device: "boiler".into(), point: "flow".into() })
+    }
+
+    fn request(payload: &str, retained: bool, stale: Option<&str>) -> Arrival {
+        let (verb, payload, stale) = ("read".into(), payload.into(), stale.map(str::to_string));
+        Arrival::Errand(Errand::Request { verb, payload, retained, stale })
+    }
+
     /// `news` is what it is when it is told just now, `retained` when the broker has kept it.
     #[track_caller]
-    fn check(topic: &str, payload: &str, news: &Arrival<'_>, retained: &Arrival<'_>) {
+    fn check(topic: &str, payload: &str, news: &Arrival, retained: &Arrival) {
         for (is_retained, expected) in [(false, news), (true, retained)] {
             let mail = Mail { topic, payload, retained: is_retained, repeated: false, stale_for: None };
             assert_eq!(arrivals("").sort(&mail), *expected, "{mail:?}");
@@ -208,18 +250,18 @@ mod tests {
     #[test]
     fn what_is_kept_is_no_wish_of_now_and_what_is_told_now_is_no_memory() {
         let nothing = &Arrival::Nothing;
-        check("busker/bridge/state", "offline", &Arrival::OwnState, nothing);
-        check("house/bridge/state", "online", &Arrival::FormerState, &Arrival::FormerState);
-        check("homeassistant/status", "online", &Arrival::HomeAssistantStarted, nothing);
+        check("busker/bridge/state", "offline", &Arrival::Heard(Heard::OwnState), nothing);
+        let former = &Arrival::Heard(Heard::FormerState);
+        check("house/bridge/state", "online", former, former);
+        check("homeassistant/status", "online", &Arrival::Heard(Heard::HomeAssistantStarted), nothing);
         check("homeassistant/status", "offline", nothing, nothing);
-        let announced = |is_news| Arrival::Announcement { is_news };
+        let announced = |is_news| Arrival::Heard(Heard::Announcement { is_news });
         check("homeassistant/device/busker_boiler/config", "{}", &announced(true), &announced(false));
         // The bus says so of a retained one.
-        let set = &Arrival::Set { device: "boiler", point: "flow" };
-        check("busker/boiler/flow/set", "21", set, set);
-        check("busker/boiler/flow/get", "", &Arrival::Get { device: "boiler", point: "flow" }, nothing);
-        let request = &Arrival::Request { verb: "read", stale: None };
-        check("busker/bridge/request/read", "{}", request, request);
+        check("busker/boiler/flow/set", "21", &set("21", false), &set("21", true));
+        check("busker/boiler/flow/get", "", &get(), nothing);
+        let of_request = |retained| request("{}", retained, None);
+        check("busker/bridge/request/read", "{}", &of_request(false), &of_request(true));
         check("busker/boiler/flow", "21", nothing, nothing);
         check("elsewhere", "", nothing, nothing);
     }
@@ -233,20 +275,18 @@ mod tests {
         {
             let mail = |topic| Mail { topic, payload: "21", retained: false, repeated, stale_for };
             let arrivals = arrivals("");
-            let Arrival::Expired { reason, outcome } = arrivals.sort(&mail("busker/boiler/flow/set")) else {
-                panic!("it is obeyed")
-            };
+            let arrival = arrivals.sort(&mail("busker/boiler/flow/set"));
+            let Arrival::Heard(Heard::Expired { reason, outcome }) = arrival else { panic!("it is obeyed") };
             assert_eq!(reason, expected);
             assert_eq!((outcome.topic.as_str(), outcome.retain), ("busker/boiler/flow/outcome", false));
             assert!(outcome.payload.contains("expired") && outcome.payload.contains(expected));
-            let request = Arrival::Request { verb: "read", stale: Some(expected.into()) };
-            assert_eq!(arrivals.sort(&mail("busker/bridge/request/read")), request);
+            let asked = arrivals.sort(&mail("busker/bridge/request/read"));
+            assert_eq!(asked, request("21", false, Some(expected)));
             // A retained one is refused for that, whenever it comes.
             let retained = Mail { retained: true, ..mail("busker/boiler/flow/set") };
-            assert_eq!(arrivals.sort(&retained), Arrival::Set { device: "boiler", point: "flow" });
+            assert_eq!(arrivals.sort(&retained), set("21", true));
             // Reading is never wrong.
-            let get = Arrival::Get { device: "boiler", point: "flow" };
-            assert_eq!(arrivals.sort(&mail("busker/boiler/flow/get")), get);
+            assert_eq!(arrivals.sort(&mail("busker/boiler/flow/get")), get());
         }
     }
 }

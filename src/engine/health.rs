@@ -22,6 +22,13 @@ pub const TOLD_EVERY: Duration = Duration::from_secs(60);
 /// The codes of the specification end with 11.
 const EXCEPTION_CODES: usize = 12;
 
+/// How much a line of the log matters. Each is said once when something breaks and once when it heals.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Severity {
+    Info,
+    Warning,
+}
+
 /// What happened on the wire, each error counted as what it was.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {

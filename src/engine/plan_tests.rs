@@ -356,10 +356,24 @@ proptest! {
     }
 }
 
-/// The cheapest reads of all combinations of places: points that stand side by side in both are moved together.
+/// What the cheapest reads of all combinations of places cost. Points that stand side by side in both places are moved
+/// together; `None` where a poll class has more than `most_runs` of such, which are too many to try.
+///
+/// No read serves two poll classes, so that the best of all is the sum of the best of each.
 fn best_of_all_second_places(device: &Device, cost: Cost, most_runs: usize) -> Option<u64> {
+    let best_of = |poll| {
+        let mut only_this = device.clone();
+        for point in only_this.points.iter_mut().filter(|point| point.poll != poll) {
+            point.poll = Poll::Never;
+        }
+        best_of_class(&only_this, poll, cost, most_runs)
+    };
+    [Poll::Fast, Poll::Slow, Poll::Once].into_iter().map(best_of).sum()
+}
+
+fn best_of_class(device: &Device, poll: Poll, cost: Cost, most_runs: usize) -> Option<u64> {
     let mut runs: Vec<Vec<PointIndex>> = Vec::new();
-    for (index, point) in device.points.iter().enumerate() {
+    for (index, point) in device.points.iter().enumerate().filter(|(_, point)| point.poll == poll) {
         let Some(also) = point.also else { continue };
         let is_beside = |last: &PointIndex| {
             let before = &device.points[*last];
@@ -368,16 +382,14 @@ fn best_of_all_second_places(device: &Device, cost: Cost, most_runs: usize) -> O
                 first(before).0 == first(next).0
                     && first(before).1.abs_diff(first(next).1) <= before.span.count() as u16
             };
-            before.poll == point.poll
-                && step(before.at, point.at)
-                && before.also.is_some_and(|before| step(before, also))
+            step(before.at, point.at) && before.also.is_some_and(|before| step(before, also))
         };
         match runs.last_mut() {
             Some(run) if run.last().is_some_and(is_beside) => run.push(index),
             _ => runs.push(vec![index]),
         }
     }
-    if runs.is_empty() || runs.len() > most_runs {
+    if runs.len() > most_runs {
         return None;
     }
     let costs = (0u32..1 << runs.len()).map(|chosen| {
@@ -402,14 +414,15 @@ fn of_every_shipped_device_the_second_places_are_chosen_best() {
             for turnaround in [1, 5, 40] {
                 let line = Line { baud, ..LINE };
                 let cost = Tariff::of_line(line, line.frame_gap()).cost(Duration::from_millis(turnaround));
-                // Four thousand combinations are looked at once only.
+                // Thousands of combinations are looked at once only.
                 let most_runs = if (baud, turnaround) == (19_200, 5) { 12 } else { 8 };
                 let Some(best) = best_of_all_second_places(&device, cost, most_runs) else { continue };
                 let found = total(&plan(&device, cost, &[]), cost);
                 assert_eq!(found, best, "{id} at {baud}, {turnaround} ms");
-                looked_at += 1;
+                looked_at += usize::from(device.points.iter().any(|point| point.also.is_some()));
             }
         }
     }
-    assert!(looked_at >= 9 * 8, "{looked_at}");
+    // Of all devices that have any, two are too large for most settings.
+    assert!(looked_at > 10 * 9, "{looked_at}");
 }

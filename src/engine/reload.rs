@@ -1,7 +1,15 @@
 //! From one configuration to another without a gap: what is left alone, what begins and what ends.
+//!
+//! [`compare`] decides it; the edge goes through it in this order: it prepares what can fail, lets end what ends, lets
+//! devices leave their buses, takes back at the broker what is gone, and only then starts buses and hands over
+//! devices, which may have been on other buses before.
 
 use std::collections::BTreeSet;
 
+use crate::engine::bus::Event;
+use crate::engine::homeassistant;
+use crate::engine::memory::Memories;
+use crate::engine::outbox::Outbox;
 use crate::engine::settings::{Bus, DeviceSettings, Rules, Settings};
 use crate::engine::topics::Topics;
 
@@ -20,6 +28,15 @@ pub struct Change {
     pub buses: Vec<(String, Fate)>,
     /// Buses that are there no more.
     pub ended: Vec<String>,
+}
+
+/// Whether what the settings name and do not hold is another now. It may be while they are the same.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Secrets {
+    /// The broker's password.
+    pub password: bool,
+    /// The token of HTTP.
+    pub token: bool,
 }
 
 /// How what is known is told from now on.
@@ -46,8 +63,16 @@ pub enum Fate {
 }
 
 impl Change {
-    /// What a device goes on with from memory is not so any more: each leaves its bus and comes to it again.
-    pub fn every_device_begins_anew(&mut self, old: &Settings, new: &Settings) {
+    /// Things are remembered in another place from now on. Where one of the two keeps nothing, what devices go on with
+    /// from memory is not so any more: each leaves its bus and comes to it again.
+    pub fn remember_elsewhere(
+        &mut self,
+        (old, before): (&Settings, &Memories),
+        (new, now): (&Settings, &Memories),
+    ) {
+        if before.unkept.is_none() && now.unkept.is_none() {
+            return;
+        }
         for (bus, fate) in &mut self.buses {
             if let Fate::Stays { leave, come } = fate {
                 *leave = devices_on(old, bus).into_iter().map(|device| device.name).collect();
@@ -59,6 +84,34 @@ impl Change {
     /// Whether the bus of this name goes on.
     pub fn stays(&self, bus: &str) -> bool {
         self.buses.iter().any(|(name, fate)| name == bus && matches!(fate, Fate::Stays { .. }))
+    }
+
+    /// The devices that leave the bus of this name, which goes on.
+    pub fn leaving(&self, bus: &str) -> &[String] {
+        let fate = self.buses.iter().find(|(name, _)| name == bus).map(|(_, fate)| fate);
+        if let Some(Fate::Stays { leave, .. }) = fate { leave } else { &[] }
+    }
+
+    /// What the bus number `index` of the new settings has to be told when all that leaves has left. `is_connected`: the
+    /// broker is there, as a bus that begins takes for granted.
+    pub fn events(&self, index: usize, memories: &Memories, is_connected: bool) -> Vec<Event> {
+        let mut events = Vec::new();
+        match &self.buses[index].1 {
+            Fate::Stays { come, .. } => {
+                events.extend(self.rules.map(Event::Rules));
+                if !come.is_empty() {
+                    let on_bus = |device: &DeviceSettings| DeviceSettings { bus: index, ..device.clone() };
+                    events.push(Event::Adopt(come.iter().map(on_bus).collect(), memories.clone()));
+                }
+            }
+            Fate::Restarts | Fate::Begins => events.extend((!is_connected).then_some(Event::BrokerDown)),
+        }
+        events
+    }
+
+    /// Whether what was told and stored so far counts no more, and all of it is due again.
+    pub fn begins_telling_anew(&self) -> bool {
+        self.telling != Telling::AsBefore || self.memory
     }
 
     /// What people are told when it has been done.
@@ -106,8 +159,20 @@ pub fn listens_before_leaving<'n>(old: &Settings, new: &'n Settings, port: Optio
     (!is_the_same).then_some(listen)
 }
 
+/// Takes back at the broker what the new settings do not have.
+pub fn take_back(outbox: &mut Outbox, old: &Settings, new: &Settings, telling: Telling) {
+    let before = match telling {
+        // Has been taken back, as far as it could be.
+        Telling::Elsewhere => BTreeSet::new(),
+        Telling::AsBefore | Telling::Otherwise => topics_of_devices(old),
+    };
+    outbox.reconfigure(homeassistant::identities(new), &before, &topics_of_devices(new));
+    let topics = Topics::of(&new.mqtt);
+    changed_devices(old, new).iter().for_each(|device| outbox.announced_anew(&topics.identity(device)));
+}
+
 /// Compares two configurations.
-pub fn compare(old: &Settings, new: &Settings) -> Change {
+pub fn compare(old: &Settings, new: &Settings, changed: Secrets) -> Change {
     let telling = |settings: &Settings| {
         let mqtt = &settings.mqtt;
         (mqtt.topics.clone(), mqtt.values, mqtt.json, settings.home_assistant.clone())
@@ -132,8 +197,8 @@ pub fn compare(old: &Settings, new: &Settings) -> Change {
     };
     let is_gone = |bus: &&Bus| !new.buses.iter().any(|other| other.name == bus.name);
     Change {
-        broker: !old.mqtt.is_reached_as(&new.mqtt),
-        http: old.http != new.http,
+        broker: !old.mqtt.is_reached_as(&new.mqtt) || changed.password,
+        http: old.http != new.http || changed.token,
         telling,
         memory: old.state_dir != new.state_dir,
         rules: (old.rules() != new.rules()).then(|| new.rules()),
@@ -149,7 +214,7 @@ fn devices_on(settings: &Settings, bus: &str) -> Vec<DeviceSettings> {
 }
 
 /// The names of all devices that are not as they were: also those of buses that restart or end.
-pub fn changed_devices(old: &Settings, new: &Settings) -> BTreeSet<String> {
+fn changed_devices(old: &Settings, new: &Settings) -> BTreeSet<String> {
     let with_bus = |settings: &Settings, name: &str| {
         let device = settings.devices.iter().find(|device| device.name == name)?;
         Some((settings.buses[device.bus].clone(), DeviceSettings { bus: 0, ..device.clone() }))
@@ -203,7 +268,7 @@ devices:
             assert!(text.contains(from), "{from}");
             text = text.replace(from, to);
         }
-        let change = compare(&settings(BEFORE), &settings(&text));
+        let change = compare(&settings(BEFORE), &settings(&text), Secrets::default());
         let mut words: Vec<String> = Vec::new();
         words.extend(change.broker.then(|| "broker".into()));
         words.extend(change.http.then(|| "http".into()));
@@ -276,6 +341,65 @@ devices:
     }
 
     #[test]
+    fn a_secret_that_is_another_is_a_change_although_the_settings_are_the_same() {
+        for (password, token) in [(false, false), (true, false), (false, true)] {
+            let same = settings(BEFORE);
+            let change = compare(&same, &same, Secrets { password, token });
+            assert_eq!((change.broker, change.http), (password, token));
+            assert_eq!(change.is_nothing(), !password && !token);
+        }
+    }
+
+    /// A change in which bus `a` stays, `b` begins anew and `c` is new.
+    fn change() -> (Settings, Settings, Change) {
+        let after = BEFORE
+            .replace("two: {bus: a, unit: 2", "two: {bus: a, unit: 4")
+            .replace("'host:503'}", "'host:504'}, c: {tcp: 'host:505'}");
+        let (old, new) = (settings(BEFORE), settings(&format!("eeprom: {{daily: 7}}{after}")));
+        let change = compare(&old, &new, Secrets::default());
+        (old, new, change)
+    }
+
+    /// What the bus number `index` is told, in a few words.
+    fn told(change: &Change, index: usize, is_connected: bool) -> Vec<String> {
+        let word = |event| match event {
+            Event::Rules(_) => "rules".to_string(),
+            Event::Adopt(devices, _) => {
+                assert!(devices.iter().all(|device| device.bus == index));
+                let names: Vec<&str> = devices.iter().map(|device| device.name.as_str()).collect();
+                names.join(" and ")
+            }
+            other => format!("{other:?}"),
+        };
+        change.events(index, &Memories::default(), is_connected).into_iter().map(word).collect()
+    }
+
+    #[test]
+    fn a_bus_that_stays_is_told_what_is_new_and_one_that_begins_whether_the_broker_is_there() {
+        let (_, _, change) = change();
+        assert_eq!((change.leaving("a"), change.leaving("b")), (&["two".to_string()][..], &[][..]));
+        assert_eq!(told(&change, 0, false), ["rules", "two"]);
+        for begins in [1, 2] {
+            assert_eq!(told(&change, begins, false), ["BrokerDown"]);
+            assert!(told(&change, begins, true).is_empty());
+        }
+    }
+
+    #[test]
+    fn devices_begin_anew_where_nothing_was_or_will_be_kept_of_them() {
+        let kept = Memories::default();
+        let unkept = Memories { unkept: Some("the card is full".into()), ..Memories::default() };
+        for (before, now, adopted) in
+            [(&kept, &kept, "two"), (&kept, &unkept, "one and two"), (&unkept, &kept, "one and two")]
+        {
+            let (old, new, mut change) = change();
+            change.remember_elsewhere((&old, before), (&new, now));
+            assert_eq!(told(&change, 0, true), ["rules", adopted]);
+            assert_eq!(change.leaving("a").join(" and "), adopted);
+        }
+    }
+
+    #[test]
     fn people_are_told_what_became_of_each_bus_and_device() {
         let after = "
 eeprom: {daily: 7}
@@ -284,7 +408,7 @@ devices:
   one: {bus: a, unit: 9, points: {x: {at: input 0, poll: fast}}}
   four: {bus: a, unit: 4, points: {x: {at: input 0, poll: fast}}}
 ";
-        let change = compare(&settings(BEFORE), &settings(after));
+        let change = compare(&settings(BEFORE), &settings(after), Secrets::default());
         let expected = [
             "what holds for every bus has changed, and the buses go on",
             "bus a: two is gone",

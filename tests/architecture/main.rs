@@ -23,7 +23,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
     &["modbus", "recorder", "plan", "schedule"],
     &["identity", "state"],
     &["topics", "health", "feed", "homeassistant", "outbox", "connection"],
-    &["members", "transaction", "command", "memory", "upkeep", "arrivals", "request", "reload", "bus"],
+    &["members", "transaction", "command", "memory", "upkeep", "arrivals", "request", "bus", "reload"],
 ];
 
 /// What would let the engine wait, ask the time, open something, or answer differently from run to

@@ -5,7 +5,8 @@ use std::sync::Mutex;
 use rumqttc::Publish;
 
 use super::lock;
-use crate::engine::arrivals::{Arrival, Arrivals, Mail};
+use crate::engine::arrivals::{Arrival, Arrivals, Errand, Mail};
+use crate::engine::outbox::Heard;
 use crate::engine::time::Duration;
 
 /// What the broker has to tell the rest of the program.
@@ -13,23 +14,7 @@ use crate::engine::time::Duration;
 pub enum News {
     Up,
     Down,
-    Set {
-        device: String,
-        point: String,
-        payload: String,
-        retained: bool,
-    },
-    Get {
-        device: String,
-        point: String,
-    },
-    /// `stale` says why it would be too old to be obeyed.
-    Request {
-        verb: String,
-        payload: String,
-        retained: bool,
-        stale: Option<String>,
-    },
+    Errand(Errand),
 }
 
 /// Brings news where they belong; whoever hears of something hands it over.
@@ -59,33 +44,24 @@ impl<Tell: Fn(News)> Courier<Tell> {
         filters
     }
 
-    /// Says what a message is to this gateway.
-    pub fn sort<'m>(&self, mail: &Mail<'m>) -> Arrival<'m> {
-        lock(&self.arrivals).sort(mail)
-    }
-
     pub fn tell(&self, news: News) {
         (self.tell)(news);
     }
 
-    /// Brings what somebody wants of a bus there; `false`: it is something else. In the order in which it came, and
-    /// with nothing in between: a command that comes too late for the next request waits for a whole transaction.
-    pub fn bring(&self, mail: &Mail<'_>) -> bool {
-        let (payload, retained) = (mail.payload.into(), mail.retained);
-        let news = match self.sort(mail) {
-            Arrival::Set { device, point } => {
-                News::Set { device: device.into(), point: point.into(), payload, retained }
+    /// Brings what somebody wants of a bus there, in the order in which it came, and with nothing in between: a command
+    /// that comes too late for the next request waits for a whole transaction. Returns what the outbox has to know.
+    pub fn bring(&self, publish: &Publish, stale_for: Option<Duration>) -> Option<Heard> {
+        let payload = &String::from_utf8_lossy(&publish.payload);
+        let (retained, repeated) = (publish.retain, publish.dup);
+        let mail = Mail { topic: &publish.topic, payload, retained, repeated, stale_for };
+        let arrival = lock(&self.arrivals).sort(&mail);
+        match arrival {
+            Arrival::Errand(errand) => {
+                self.tell(News::Errand(errand));
+                None
             }
-            Arrival::Get { device, point } => News::Get { device: device.into(), point: point.into() },
-            Arrival::Request { verb, stale } => News::Request { verb: verb.into(), payload, retained, stale },
-            _ => return false,
-        };
-        self.tell(news);
-        true
+            Arrival::Heard(heard) => Some(heard),
+            Arrival::Nothing => None,
+        }
     }
-}
-
-/// A message of the library in the engine's words. `payload` is its own, as text.
-pub(super) fn mail<'m>(publish: &'m Publish, payload: &'m str, stale_for: Option<Duration>) -> Mail<'m> {
-    Mail { topic: &publish.topic, payload, retained: publish.retain, repeated: publish.dup, stale_for }
 }

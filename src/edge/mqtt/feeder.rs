@@ -2,16 +2,16 @@
 
 use std::sync::{Arc, Mutex};
 
-use rumqttc::{AsyncClient, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
+use rumqttc::{AsyncClient, QoS, SubAck, SubscribeFilter, SubscribeReasonCode};
 use tokio::sync::{mpsc, oneshot};
 
-use super::courier::{Courier, News, mail};
+use super::courier::{Courier, News};
 use super::lock;
 use super::mailbox::Mailbox;
 use super::poller::Seen;
-use super::warnings;
 use crate::edge::clock::Clock;
-use crate::engine::arrivals::{Arrival, Arrivals, Mail};
+use crate::edge::log;
+use crate::engine::arrivals::{Arrivals, Subscriptions};
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::settings::Manner;
@@ -39,14 +39,9 @@ pub(super) struct Feeder<Tell> {
     pub connected: bool,
     /// What was last told of the connection.
     pub told_up: Option<bool>,
-    /// What is still to be subscribed to.
-    pub wanted: Vec<String>,
-    /// What the broker was asked for last.
-    pub asked_for: Vec<String>,
-    /// Who wants to know when it has answered.
+    pub subscriptions: Subscriptions,
+    /// Who wants to know when the broker has answered what it was asked for.
     pub awaits_answer: Option<oneshot::Sender<()>>,
-    /// What is still to be let go of.
-    pub unwanted: Vec<String>,
     pub ending: bool,
 }
 
@@ -88,15 +83,9 @@ impl<Tell: Fn(News)> Feeder<Tell> {
     /// On the same connection: what stays is not asked for again.
     fn listen_to(&mut self, arrivals: Arrivals, told: oneshot::Sender<()>) {
         let now = arrivals.filters().to_vec();
-        let before = self.courier.listen_to(arrivals);
-        self.wanted.retain(|filter| now.contains(filter));
-        self.unwanted.retain(|filter| !now.contains(filter));
-        let (stays, goes): (Vec<String>, Vec<String>) =
-            before.into_iter().partition(|filter| now.contains(filter));
-        self.wanted.extend(now.into_iter().filter(|filter| !stays.contains(filter)));
-        self.unwanted.extend(goes);
+        self.subscriptions.change(self.courier.listen_to(arrivals), now);
         // Whoever waits waits no longer where nothing is asked, or nobody could answer.
-        self.awaits_answer = (self.connected && !self.wanted.is_empty()).then_some(told);
+        self.awaits_answer = (self.connected && !self.subscriptions.wanted().is_empty()).then_some(told);
     }
 
     fn handle(&mut self, seen: Seen) {
@@ -105,7 +94,7 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 tracing::info!("connected to the broker");
                 lock(&self.state).made();
                 self.connected = true;
-                (self.wanted, self.unwanted) = (self.courier.begin_anew(), Vec::new());
+                self.subscriptions = Subscriptions::new(self.courier.begin_anew());
                 self.mailbox.outbox().connected();
                 self.told_up = Some(true);
                 self.courier.tell(News::Up);
@@ -115,93 +104,46 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                     tracing::warn!("{reason}");
                 }
                 (self.connected, self.awaits_answer) = (false, None);
-                self.mailbox.outbox().disconnected();
-                self.judge_length(suspect);
+                let line = {
+                    let mut outbox = self.mailbox.outbox();
+                    outbox.disconnected();
+                    outbox.connection_ended(suspect)
+                };
+                log::say_all(line);
                 if self.told_up != Some(false) {
                     self.told_up = Some(false);
                     self.courier.tell(News::Down);
                 }
             }
             Seen::Unsent(messages) => self.mailbox.outbox().give_back(messages),
-            Seen::Packet { packet: Packet::Publish(publish), stale_for } => {
+            Seen::Heard { heard, publish } => {
                 let payload = String::from_utf8_lossy(&publish.payload);
-                self.receive(&mail(&publish, &payload, stale_for));
+                let now = self.clock.now();
+                let lines = self.mailbox.outbox().hear(heard, &publish.topic, &payload, now);
+                log::say_all(lines);
             }
-            Seen::Packet { packet: Packet::SubAck(answer), .. } => {
-                let codes = answer.return_codes.iter().zip(&self.asked_for);
-                let refused = codes.filter(|(code, _)| **code == SubscribeReasonCode::Failure);
-                let refused: Vec<&str> = refused.map(|(_, filter)| filter.as_str()).collect();
-                if !refused.is_empty() {
-                    tracing::warn!(
-                        "the broker does not let this user subscribe to `{}`; what is told there, commands perhaps, \
-                         will not arrive",
-                        refused.join("`, `")
-                    );
-                }
-                let mut outbox = self.mailbox.outbox();
-                outbox.cannot_hear(&refused);
-                outbox.listens(self.clock.now());
-                drop(outbox);
-                if let Some(told) = self.awaits_answer.take() {
-                    // Perhaps nobody waits any more.
-                    let _ = told.send(());
-                }
-            }
-            Seen::Packet { .. } | Seen::Room => {}
+            Seen::Subscribed(answer) => self.subscribed(&answer),
+            Seen::Room => {}
         }
     }
 
-    /// A broker that takes no message as long as the one which it was sent has no other word for that than to close
-    /// the connection.
-    fn judge_length(&self, suspect: Option<(String, usize)>) {
-        let mut outbox = self.mailbox.outbox();
-        let Some((topic, bytes)) = suspect else { return outbox.lost() };
-        if outbox.closed_on(&topic, bytes) {
+    fn subscribed(&mut self, answer: &SubAck) {
+        let is_granted = |code: &SubscribeReasonCode| *code != SubscribeReasonCode::Failure;
+        let refused = self.subscriptions.refused(answer.return_codes.iter().map(is_granted));
+        if !refused.is_empty() {
             tracing::warn!(
-                "the broker closes the connection whenever it is sent what belongs on `{topic}`, {bytes} bytes: most \
-                 likely it takes no message that long (`max_packet_size` of mosquitto). It is not sent again; the \
-                 topics that miss something stand under `kept_back` in `/health`"
+                "the broker does not let this user subscribe to `{}`; what is told there, commands perhaps, will not \
+                 arrive",
+                refused.join("`, `")
             );
         }
-    }
-
-    fn receive(&mut self, mail: &Mail<'_>) {
-        let Mail { topic, payload, .. } = *mail;
-        match self.courier.sort(mail) {
-            // The last word is this gateway's own, when it ends.
-            Arrival::OwnState if self.ending => {}
-            Arrival::OwnState => self.heard_state(payload),
-            Arrival::FormerState => {
-                let somebody = {
-                    let mut outbox = self.mailbox.outbox();
-                    let somebody = outbox.heard_former(topic, payload);
-                    warnings::tell(&mut outbox, &self.topics);
-                    somebody
-                };
-                if let Some(base) = somebody {
-                    tracing::warn!(
-                        "what this gateway told below `{base}` before is not taken back: somebody else is online there"
-                    );
-                }
-            }
-            Arrival::HomeAssistantStarted => {
-                tracing::info!("Home Assistant is there: it is told of everything again");
-                self.mailbox.outbox().home_assistant_started(self.clock.now());
-            }
-            Arrival::Announcement { is_news } => {
-                let mut outbox = self.mailbox.outbox();
-                match is_news {
-                    true => outbox.heard_announcement(topic, payload, self.clock.now()),
-                    false => outbox.found(topic, payload),
-                }
-                warnings::tell(&mut outbox, &self.topics);
-            }
-            Arrival::Expired { reason, outcome } => {
-                tracing::warn!("`{topic}` is not obeyed: {reason}");
-                self.mailbox.outbox().push(outcome);
-            }
-            // The courier has brought it.
-            Arrival::Set { .. } | Arrival::Get { .. } | Arrival::Request { .. } | Arrival::Nothing => {}
+        let mut outbox = self.mailbox.outbox();
+        outbox.cannot_hear(&refused);
+        outbox.listens(self.clock.now());
+        drop(outbox);
+        if let Some(told) = self.awaits_answer.take() {
+            // Perhaps nobody waits any more.
+            let _ = told.send(());
         }
     }
 
@@ -221,24 +163,18 @@ impl<Tell: Fn(News)> Feeder<Tell> {
             outbox.listen_longer(now);
         }
         outbox.wake(now);
-        warnings::tell(&mut outbox, &self.topics);
-    }
-
-    fn heard_state(&mut self, payload: &str) {
-        if self.mailbox.outbox().heard_state(payload, self.clock.now()) {
-            tracing::warn!(
-                "somebody else tells `{}` on `{}` again and again, and is put right some times a minute: has another \
-                 gateway `base_topic: {}`?",
-                payload.chars().take(20).collect::<String>(),
-                self.topics.bridge_state(),
-                self.topics.base()
-            );
-        }
+        let lines = outbox.take_lines();
+        drop(outbox);
+        log::say_all(lines);
     }
 
     /// When the broker is asked next whether it is there.
     fn asks_at(&self) -> Option<Time> {
-        if self.connected && self.wanted.is_empty() { lock(&self.connection).asks_at() } else { None }
+        if self.connected && self.subscriptions.wanted().is_empty() {
+            lock(&self.connection).asks_at()
+        } else {
+            None
+        }
     }
 
     /// Asks what a broker answers and nobody else hears of: to be told no more of what this gateway was never told
@@ -274,22 +210,23 @@ impl<Tell: Fn(News)> Feeder<Tell> {
                 return false;
             }
         }
-        self.wanted.is_empty() && outbox.is_empty()
+        self.subscriptions.wanted().is_empty() && outbox.is_empty()
     }
 
     fn subscribe(&mut self) {
-        if !self.wanted.is_empty() {
+        let wanted = self.subscriptions.wanted();
+        if !wanted.is_empty() {
             let filter = |path: &String| SubscribeFilter::new(path.clone(), QoS::AtLeastOnce);
-            if self.client.try_subscribe_many(self.wanted.iter().map(filter)).is_ok() {
-                self.asked_for = std::mem::take(&mut self.wanted);
+            if self.client.try_subscribe_many(wanted.iter().map(filter)).is_ok() {
+                self.subscriptions.asked();
             }
         }
         // Where the library has no room, it is tried again when it has.
-        while let Some(filter) = self.unwanted.last() {
+        while let Some(filter) = self.subscriptions.unwanted() {
             if self.client.try_unsubscribe(filter).is_err() {
                 return;
             }
-            self.unwanted.pop();
+            self.subscriptions.let_go();
         }
     }
 

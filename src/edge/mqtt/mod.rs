@@ -6,7 +6,6 @@ mod feeder;
 mod losses;
 mod mailbox;
 mod poller;
-mod warnings;
 
 use std::sync::{Arc, Mutex};
 
@@ -23,7 +22,7 @@ use self::poller::Poller;
 use crate::edge::clock::Clock;
 use crate::edge::lock::lock;
 use crate::edge::secrets::Secrets;
-use crate::engine::arrivals::Arrivals;
+use crate::engine::arrivals::{Arrivals, Subscriptions};
 use crate::engine::connection::Connection;
 use crate::engine::health::BrokerReport;
 use crate::engine::outbox::Outbox;
@@ -122,10 +121,8 @@ impl Broker {
             connection: connection.clone(),
             connected: false,
             told_up: None,
-            wanted: Vec::new(),
-            asked_for: Vec::new(),
+            subscriptions: Subscriptions::default(),
             awaits_answer: None,
-            unwanted: Vec::new(),
             ending: false,
         };
         let feeder = tokio::spawn(async move {

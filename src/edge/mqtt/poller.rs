@@ -2,17 +2,17 @@
 
 use std::sync::{Arc, Mutex};
 
-use rumqttc::{ConnectionError, EventLoop, Outgoing, Packet, Publish, Request};
+use rumqttc::{ConnectionError, EventLoop, Outgoing, Packet, Publish, Request, SubAck};
 use tokio::sync::mpsc;
 
-use super::courier::{Courier, News, mail};
+use super::courier::{Courier, News};
 use super::lock;
 use super::losses::{Ends, loss};
 use crate::edge::clock::Clock;
 use crate::edge::secrets::Secrets;
 use crate::engine::connection::Connection;
+use crate::engine::outbox::Heard;
 use crate::engine::settings::Mqtt;
-use crate::engine::time::Duration;
 use crate::engine::topics::Message;
 
 /// Polls the client library and nothing else: a library that is not polled neither sends nor answers
@@ -66,14 +66,16 @@ impl<Tell: Fn(News)> Poller<Tell> {
                 connection.heard(now);
                 let stale_for = connection.stale_for(now);
                 drop(connection);
-                let is_dealt_with = match &packet {
+                match packet {
                     Packet::Publish(publish) => {
-                        let payload = String::from_utf8_lossy(&publish.payload);
-                        self.courier.bring(&mail(publish, &payload, stale_for))
+                        let heard = self.courier.bring(&publish, stale_for)?;
+                        Some(Seen::Heard { heard, publish })
                     }
-                    packet => matches!(packet, Packet::UnsubAck(_)),
-                };
-                (!is_dealt_with).then_some(Seen::Packet { packet, stale_for })
+                    Packet::SubAck(answer) => Some(Seen::Subscribed(answer)),
+                    Packet::UnsubAck(_) => None,
+                    // Whatever the broker confirms makes room.
+                    _ => Some(Seen::Room),
+                }
             }
             rumqttc::Event::Outgoing(Outgoing::Unsubscribe(_)) => None,
             rumqttc::Event::Outgoing(sent) => {
@@ -169,12 +171,14 @@ pub(super) enum Seen {
     },
     /// Messages told once that the library had taken and the broker has not.
     Unsent(Vec<Message>),
-    Packet {
-        packet: Packet,
-        /// How old it may be, if it was held up on its way.
-        stale_for: Option<Duration>,
+    /// A message for the outbox.
+    Heard {
+        heard: Heard,
+        publish: Publish,
     },
-    /// The library has taken something: there is room for more.
+    /// The broker's answer to what it was asked to send.
+    Subscribed(SubAck),
+    /// The library has taken something, or the broker has: there may be room for more.
     Room,
 }
 
@@ -189,7 +193,7 @@ mod tests {
     use rumqttc::{AsyncClient, MqttOptions, QoS, StateError};
 
     use super::*;
-    use crate::engine::arrivals::Arrivals;
+    use crate::engine::arrivals::{Arrivals, Command, Errand};
     use crate::engine::configuration;
     use crate::engine::profile::Library;
     use crate::engine::time::Time;
@@ -258,11 +262,12 @@ mod tests {
             let first = events.recv().await.expect("two things are told");
             // What is for a bus is there, and nobody else hears of it.
             let (device, point, payload) = ("a".into(), "b".into(), "ON".into());
-            assert_eq!(*lock(&told), [News::Set { device, point, payload, retained: false }]);
-            let Seen::Packet { packet: Packet::Publish(state), stale_for: None } = first else {
+            let command = Command { device, point, payload, retained: false };
+            assert_eq!(*lock(&told), [News::Errand(Errand::Set(command))]);
+            let Seen::Heard { heard: Heard::OwnState, publish } = first else {
                 panic!("the state was not handed on")
             };
-            assert_eq!(state.topic, "busker/bridge/state");
+            assert_eq!(publish.topic, "busker/bridge/state");
             let second = events.recv().await.expect("two things are told");
             assert!(matches!(second, Seen::Down { reason, contested: false, .. } if reason.contains("`id`")));
             task.abort();

@@ -37,6 +37,8 @@ use crate::engine::settings::{DeviceSettings, Link, OnBrokerLoss, Rules, Setting
 use crate::engine::time::{Date, Duration, Time};
 use crate::engine::topics::Message;
 
+pub use crate::engine::arrivals::Command;
+pub use crate::engine::health::Severity;
 pub use commands::STOPPING;
 use commands::{Active, Settling};
 use context::Context;
@@ -87,16 +89,6 @@ pub enum Event {
     Shutdown,
 }
 
-/// A message on a `set` topic, as it came.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Command {
-    pub device: String,
-    pub point: String,
-    pub payload: String,
-    /// A replayed one; it is never obeyed.
-    pub retained: bool,
-}
-
 /// What is to be done.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Action {
@@ -124,12 +116,6 @@ pub enum Action {
     },
     /// A line for the log: said once when something breaks and once when it heals.
     Say(Severity, String),
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Severity {
-    Info,
-    Warning,
 }
 
 /// So many actions find room that no memory is asked for.

@@ -26,7 +26,7 @@ pub(super) struct Arriving {
 
 /// What the broker has confirmed and does not hand on.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NotArriving {
+pub(super) struct NotArriving {
     pub topics: Vec<String>,
     /// The bytes of the shortest of it, if all that is shorter has come back: it may be too long.
     pub too_long: Option<usize>,
@@ -54,8 +54,8 @@ impl Outbox {
         self.arriving.missing.iter().cloned().collect()
     }
 
-    /// The same if nobody has been told of it yet.
-    pub fn take_news_of_arriving(&mut self) -> Option<NotArriving> {
+    /// The same if nobody has been told of it yet: [`Outbox::take_lines`].
+    pub(super) fn take_news_of_arriving(&mut self) -> Option<NotArriving> {
         self.arriving.news.take()
     }
 

@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 
 use super::Outbox;
 use crate::engine::time::{Duration, Time};
+use crate::engine::topics::OFFLINE;
 
 /// So often the state is put right in so long; after that when its time has come.
 pub(super) const CORRECTIONS: usize = 5;
@@ -57,12 +58,15 @@ impl Claim {
 }
 
 impl Outbox {
-    /// Somebody has told the gateway's state, itself perhaps. What is not so is put right. Not to be told what the
-    /// broker kept from before this connection, since the state follows then anyway. Whether a quarrel about it has
-    /// begun by that: people should know, once.
-    pub fn heard_state(&mut self, payload: &str, now: Time) -> bool {
+    /// Somebody has told the gateway's state, itself perhaps. What is not so is put right, unless this gateway has said
+    /// goodbye: then that is its last word. Not to be told what the broker kept from before this connection, since the
+    /// state follows then anyway. Whether a quarrel about it has begun by that: people should know, once.
+    pub(super) fn heard_state(&mut self, payload: &str, now: Time) -> bool {
         let topic = self.topics.bridge_state();
         if let Some(entry) = self.retained.get(&*topic) {
+            if entry.payload == OFFLINE {
+                return false;
+            }
             if *entry.payload == *payload {
                 self.claim.due = None;
                 self.has_arrived(&topic, payload.len(), now);
@@ -122,6 +126,21 @@ mod tests {
             outbox.heard_state("online", at(2));
             check_sent(&mut outbox, &[]);
         }
+    }
+
+    #[test]
+    fn the_last_word_is_the_goodbye() {
+        let mut outbox = outbox();
+        outbox.connected();
+        outbox.goodbye();
+        check_sent(&mut outbox, &["busker/bridge/state offline"]);
+        outbox.heard_state("online", at(1));
+        check_sent(&mut outbox, &[]);
+        // Another connection begins with another word.
+        outbox.connected();
+        check_sent(&mut outbox, &[STATE]);
+        outbox.heard_state("offline", at(2));
+        check_sent(&mut outbox, &[STATE]);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use super::{Outbox, Queued};
 impl Outbox {
     /// The broker remembers this announcement, perhaps of an earlier run. What it holds and we do not
     /// have any more is taken away properly; announcements that are not ours are left alone.
-    pub fn found(&mut self, topic: &str, payload: &str) {
+    pub(super) fn found(&mut self, topic: &str, payload: &str) {
         let Some(found) = Announcement::parse(&self.topics, topic, payload) else {
             if !self.found_of_former(topic, payload) {
                 self.found_of_rival(topic, payload);

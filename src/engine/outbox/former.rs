@@ -77,7 +77,7 @@ impl Outbox {
     }
 
     /// What stands on one of [`Outbox::former_states`]. The base topic that is left alone, since somebody is there.
-    pub fn heard_former(&mut self, topic: &str, payload: &str) -> Option<String> {
+    pub(super) fn heard_former(&mut self, topic: &str, payload: &str) -> Option<String> {
         let at = self.formers.iter().position(|former| former.topics().bridge_state() == topic)?;
         if payload != ONLINE {
             return None;

@@ -43,7 +43,7 @@ enum Place {
 
 /// Another gateway has been found in a place of this one.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RivalNews {
+pub(super) struct RivalNews {
     /// Where Home Assistant looks for the device.
     pub topic: String,
     pub base_topic: String,
@@ -104,13 +104,13 @@ impl Outbox {
         rivals.map(|(topic, rival)| (topic.clone(), rival.base_topic.clone())).collect()
     }
 
-    /// Those that nobody has been told of yet.
-    pub fn take_news_of_rivals(&mut self) -> Vec<RivalNews> {
+    /// Those that nobody has been told of yet: [`Outbox::take_lines`].
+    pub(super) fn take_news_of_rivals(&mut self) -> Vec<RivalNews> {
         std::mem::take(&mut self.rivals.news)
     }
 
     /// Somebody, this gateway most likely, has told something on a discovery topic just now.
-    pub fn heard_announcement(&mut self, topic: &str, payload: &str, now: Time) {
+    pub(super) fn heard_announcement(&mut self, topic: &str, payload: &str, now: Time) {
         if !self.own_devices.contains(topic) {
             return self.rivals.heard_elsewhere(topic, payload);
         }

@@ -68,7 +68,7 @@ pub fn may_be_too_long(bytes: usize) -> bool {
 impl Outbox {
     /// The broker has closed the connection, and had not confirmed a message of so many bytes on this topic, the
     /// longest of all. Whether it is found to be too long with that.
-    pub fn closed_on(&mut self, topic: &str, bytes: usize) -> bool {
+    pub(super) fn closed_on(&mut self, topic: &str, bytes: usize) -> bool {
         if !may_be_too_long(bytes) {
             self.lost();
             return false;
@@ -87,7 +87,7 @@ impl Outbox {
 
     /// The connection was lost for another reason, or could not be made: the broker may be another one by now, or
     /// may have been told another limit.
-    pub fn lost(&mut self) {
+    pub(super) fn lost(&mut self) {
         self.too_long = TooLong::default();
     }
 

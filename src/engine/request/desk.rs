@@ -1,4 +1,5 @@
-//! Where requests arrive: each is for one bus, or is answered here with what would be right.
+//! Where everything arrives that somebody wants over MQTT: it is for one bus, or is answered here with what would be
+//! right.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Weak};
@@ -7,6 +8,7 @@ use serde_json::Value as Json;
 
 use super::object::{Object, transaction_of, words};
 use super::{Request, Scan, Status, Verb, Wish, answer};
+use crate::engine::arrivals::{Command, Errand};
 use crate::engine::command::{self, Outcome, OutcomeKind};
 use crate::engine::device::Identify;
 use crate::engine::profile::Library;
@@ -18,18 +20,28 @@ use crate::engine::yaml::{Scalar, list_of_choices};
 /// A bus that was forgotten in its pause comes back after this.
 const PAUSE_LONGEST: Duration = Duration::from_secs(3600);
 
-/// What is to be done with a request, or with a command that is for no bus.
+/// What is to be done with what somebody wants. The numbers are those of buses.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Decision {
-    /// It is for the bus of this number.
+    /// The bus gets the request; [`Desk::no_room`] answers if it does not take it.
     Ask(usize, Request),
+    /// The bus gets the command; [`Desk::outcome`] is told if it does not take it.
+    Obey(usize, Command),
+    /// The bus is to read this point. Where it does not take that, the next poll reads it.
+    Read {
+        bus: usize,
+        device: String,
+        point: String,
+    },
     Answer(Message),
     /// It is ignored, and people should know.
     Warn(String),
+    /// It is ignored, which is of interest only to who looks closely.
+    Mention(String),
     Ignore,
 }
 
-/// Where requests arrive.
+/// Knows which device is on which bus, and what can be asked for.
 pub struct Desk {
     topics: Topics,
     /// Device to bus.
@@ -57,6 +69,27 @@ impl Desk {
             known: None,
             ticket: Weak::new(),
             warned: BTreeSet::new(),
+        }
+    }
+
+    /// Decides what is to be done with what somebody wants. `today` is only told.
+    pub fn decide(&mut self, today: Date, errand: Errand) -> Decision {
+        match errand {
+            Errand::Set(command) => self.command(command),
+            Errand::Get { device, point } => match self.bus_of(&device) {
+                Some(bus) => Decision::Read { bus, device, point },
+                None => {
+                    let text = format!("a message for `{device}`, which is no device of this gateway");
+                    Decision::Mention(text)
+                }
+            },
+            // One that the broker has kept is ignored whatever its age.
+            Errand::Request { verb, payload, retained: false, stale: Some(reason) } => {
+                self.refuse(&verb, &payload, &reason)
+            }
+            Errand::Request { verb, payload, retained, stale: _ } => {
+                self.take(today, &verb, &payload, retained)
+            }
         }
     }
 
@@ -88,32 +121,27 @@ impl Desk {
     }
 
     /// The answer to a request that is not read because it is too old, and why.
-    pub fn refuse(&self, verb: &str, payload: &str, reason: &str) -> Decision {
+    fn refuse(&self, verb: &str, payload: &str, reason: &str) -> Decision {
         let transaction = transaction_of(payload);
         let error = format!("not obeyed: {reason}");
         Decision::Answer(answer(&self.topics, verb, &transaction, Status::Error, Json::Null, Some(&error)))
     }
 
     /// The number of the bus that this device is on.
-    pub fn bus_of(&self, device: &str) -> Option<usize> {
+    fn bus_of(&self, device: &str) -> Option<usize> {
         self.bus_of.get(device).copied()
     }
 
-    /// The number of the bus that a message on a `set` topic is for. If it is for none, of no device or too long to be
-    /// a value: what is to be done with it. What is retained is nobody's wish of now.
-    pub fn bus_of_set(
-        &self,
-        device: &str,
-        point: &str,
-        wanted: &str,
-        retained: bool,
-    ) -> Result<usize, Decision> {
-        let outcome = match (self.bus_of(device), Outcome::of_too_long(wanted)) {
-            (Some(bus), None) => return Ok(bus),
+    /// A command for no device, or too long to be a value, is refused. What is retained is nobody's wish of now.
+    fn command(&self, command: Command) -> Decision {
+        let Command { device, point, payload, retained } = &command;
+        let outcome = match (self.bus_of(device), Outcome::of_too_long(payload)) {
+            (Some(bus), None) => return Decision::Obey(bus, command),
+            _ if *retained => return Decision::Ignore,
             (Some(_), Some(too_long)) => too_long,
-            (None, _) => command::Wish::parse(wanted).ended(OutcomeKind::Refused, self.no_device(device)),
+            (None, _) => command::Wish::parse(payload).ended(OutcomeKind::Refused, self.no_device(device)),
         };
-        Err(if retained { Decision::Ignore } else { Decision::Answer(self.outcome(device, point, &outcome)) })
+        Decision::Answer(self.outcome(device, point, &outcome))
     }
 
     /// How a command has ended, for whoever gave it.
@@ -286,18 +314,25 @@ devices:
 
     #[test]
     fn a_command_for_no_device_is_refused_and_so_is_a_book() {
-        let desk = desk();
-        assert_eq!(desk.bus_of_set("relays", "output_1", "ON", false), Ok(0));
+        let decide = |device: &str, payload: &str, retained| {
+            let (device, point, payload) = (device.into(), "output_1".into(), payload.into());
+            let command = Command { device, point, payload, retained };
+            (desk().decide(Date(0), Errand::Set(command.clone())), command)
+        };
+        for retained in [false, true] {
+            let (decision, command) = decide("relays", "ON", retained);
+            assert_eq!(decision, Decision::Obey(0, command), "the bus says what it thinks of a retained one");
+        }
         for (device, wanted, expected) in [
             ("relay", "ON", "there is no device `relay`; did you mean `relays`?"),
             ("relays", &"7".repeat(5000), "5000 bytes are no value; expected at most 1024"),
         ] {
-            let Err(Decision::Answer(message)) = desk.bus_of_set(device, "output_1", wanted, false) else {
+            let (Decision::Answer(message), _) = decide(device, wanted, false) else {
                 panic!("`{device}` is a device")
             };
             assert_eq!(message.topic, format!("busker/{device}/output_1/outcome"));
             assert!(message.payload.contains("refused") && message.payload.contains(expected), "{message:?}");
-            assert_eq!(desk.bus_of_set(device, "output_1", wanted, true), Err(Decision::Ignore));
+            assert_eq!(decide(device, wanted, true).0, Decision::Ignore);
         }
     }
 
@@ -403,7 +438,13 @@ devices:
 
     #[test]
     fn a_request_that_was_held_up_is_answered_and_not_obeyed() {
-        let decision = desk().refuse("write", r#"{"transaction":"7"}"#, "it may be 30 s old");
+        let request = |retained| Errand::Request {
+            verb: "write".into(),
+            payload: r#"{"transaction":"7"}"#.into(),
+            retained,
+            stale: Some("it may be 30 s old".into()),
+        };
+        let decision = desk().decide(Date(0), request(false));
         let Decision::Answer(message) = decision else { panic!("{decision:?}") };
         let expected =
             r#"{"transaction":"7","status":"error","data":null,"error":"not obeyed: it may be 30 s old"}"#;
@@ -411,6 +452,17 @@ devices:
             (message.topic.as_str(), message.payload.as_str()),
             ("busker/bridge/response/write", expected)
         );
+        let decision = desk().decide(Date(0), request(true));
+        assert!(matches!(decision, Decision::Warn(_)), "{decision:?}");
+    }
+
+    #[test]
+    fn a_point_is_read_by_the_bus_of_its_device() {
+        let get = |device: &str| Errand::Get { device: device.into(), point: "flow".into() };
+        let expected = Decision::Read { bus: 1, device: "boiler".into(), point: "flow".into() };
+        assert_eq!(desk().decide(Date(0), get("boiler")), expected);
+        let text = "a message for `kettle`, which is no device of this gateway";
+        assert_eq!(desk().decide(Date(0), get("kettle")), Decision::Mention(text.into()));
     }
 
     #[test]
