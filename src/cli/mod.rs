@@ -18,6 +18,7 @@ pub mod configuration;
 mod demo;
 mod diagnose;
 mod doctor;
+mod identify;
 pub mod log;
 pub mod output;
 mod plan;
@@ -52,6 +53,7 @@ verbs! {
     diagnose Diagnose,
     demo Demo,
     doctor Doctor,
+    identify Identify,
     plan Plan,
     profiles Profiles,
     read Read,

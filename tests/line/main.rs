@@ -3,6 +3,7 @@
 
 mod by_hand;
 mod doctor;
+mod identify;
 mod pcapng;
 #[path = "../support/peer.rs"]
 mod peer;
