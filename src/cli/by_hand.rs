@@ -136,7 +136,7 @@ fn open(
     Ok(Asked { link, unit, broadcasts, timeout, device })
 }
 
-fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
+pub fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
     match address.rsplit_once(':') {
         Some((host, port)) if !host.is_empty() && (!host.contains(':') || host.ends_with(']')) => {
             let number =

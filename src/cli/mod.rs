@@ -25,6 +25,7 @@ mod plan;
 mod profiles;
 mod read;
 mod run;
+mod scan;
 mod settings;
 mod simulate;
 mod write;
@@ -58,6 +59,7 @@ verbs! {
     profiles Profiles,
     read Read,
     run Run,
+    scan Scan,
     settings Settings,
     simulate Simulate,
     write Write,

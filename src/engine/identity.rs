@@ -3,7 +3,7 @@
 mod interview;
 mod proposal;
 
-pub use interview::{Interview, Known, known};
+pub use interview::{Interview, Known, known, nameless};
 pub use proposal::{entry, name_for};
 
 use crate::engine::device::Identify;

@@ -10,7 +10,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
     &["time", "value", "address"],
     &["yaml", "device", "test_device", "codec", "units", "settings", "profile", "wanted", "configuration"],
     &["modbus", "recorder", "plan", "schedule"],
-    &["identity", "state"],
+    &["identity", "scan", "state"],
     &["topics", "health", "feed", "homeassistant", "outbox", "connection"],
     &["members", "transaction", "command", "memory", "upkeep", "arrivals", "request", "reload", "bus"],
 ];

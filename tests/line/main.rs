@@ -8,6 +8,7 @@ mod pcapng;
 #[path = "../support/peer.rs"]
 mod peer;
 mod recorder;
+mod scan;
 #[path = "../support/mod.rs"]
 mod support;
 

@@ -25,6 +25,12 @@ pub fn known(library: &Library) -> Known {
     Arc::new(library.ids().into_iter().filter_map(identify).collect())
 }
 
+/// The profiles of `library` that go by nothing: their devices tell nobody who they are.
+pub fn nameless(library: &Library) -> Vec<String> {
+    let is_nameless = |id: &&str| library.load(id).is_ok_and(|device| device.identify.is_none());
+    library.ids().into_iter().filter(is_nameless).map(String::from).collect()
+}
+
 /// The registers by which profiles know their devices, asked of one that does not tell its name.
 const REGISTERS_MAX: usize = 4;
 /// Read of a device that has answered nothing else: whoever it is says something to that, if only that it
