@@ -274,7 +274,7 @@ impl State {
         let unit = frame.unit;
         let answered_at = &mut self.answered_at[usize::from(unit)];
         let mut sent_at = now;
-        for mut answer in self.line.hear(now, framing, received) {
+        for mut answer in self.line.hear(now, framing, received, None) {
             // A device that is late does one thing after the other: nothing overtakes.
             answer.at = answer.at.max(*answered_at + Duration::from_millis(1));
             *answered_at = answer.at;

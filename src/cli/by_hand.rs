@@ -13,9 +13,10 @@ use crate::engine::address::Span;
 use crate::engine::codec::{self, Raw};
 use crate::engine::command::{CommandFlow, Outcome, Step, words_of};
 use crate::engine::device::{Device, PointIndex};
-use crate::engine::identity;
+use crate::engine::identity::{self, Interview};
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
+use crate::engine::profile::Library;
 use crate::engine::settings::{self, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::Scalar;
@@ -98,6 +99,16 @@ impl ByHand {
         open(&link, None, unit, demanded.unwrap_or_default().max(self.timeout), device)
     }
 
+    /// The profiles that are known: the shipped ones, and over them those of the configuration.
+    pub fn library(&self) -> Result<Library, Failure> {
+        match &self.line.config {
+            None => Ok(Library::shipped()),
+            Some(path) => {
+                configuration::load(path)?.map(|loaded| loaded.library).map_err(configuration::faults)
+            }
+        }
+    }
+
     fn open_configured(&self) -> Result<Asked, Failure> {
         let path = self.line.config.clone().unwrap_or_default();
         let settings = configuration::ConfigurationArgs { config: path }.load()?;
@@ -125,7 +136,7 @@ fn open(
     Ok(Asked { link, unit, broadcasts, timeout, device })
 }
 
-fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
+pub fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
     match address.rsplit_once(':') {
         Some((host, port)) if !host.is_empty() && (!host.contains(':') || host.ends_with(']')) => {
             let number =
@@ -178,6 +189,14 @@ impl Asked {
         identity::check(identify, &answer)
             .map(Some)
             .map_err(|found| anyhow!("unit {unit} is no {}: {found}", device.profile).into())
+    }
+
+    /// Asks everything that `interview` wants to know.
+    pub fn interview(&mut self, mut interview: Interview) -> Result<Interview, Failure> {
+        while let Some(call) = interview.question() {
+            interview.answered(&self.ask(&call)?);
+        }
+        Ok(interview)
     }
 
     /// Takes every step of a command that begins with the question `first`.

@@ -4,6 +4,7 @@ use serde_json::{Map, Value, json};
 
 use super::by_hand::{Asked, ByHand};
 use super::{Failure, output};
+use crate::engine::identity::{Interview, Known};
 use crate::engine::modbus::names::{COUNTERS, QUERY, hexadecimal, object_name};
 use crate::engine::modbus::{Answer, Call, RequestError};
 
@@ -28,8 +29,6 @@ type Finding = (String, Result<Value, RequestError>);
 pub fn run(args: Args) -> Result<(), Failure> {
     let mut device = args.device.open()?;
     let mut findings = identification(&mut device)?;
-    let server_id = device.ask(&Call::ReportServerId)?;
-    findings.push(("server_id".into(), server_id.map(|answer| told(&answer))));
     let query = Call::Diagnostics { function: 0, data: vec![QUERY] };
     findings.push(("query_returned".into(), device.ask(&query)?.map(|_| Value::Bool(true))));
     for (function, name) in COUNTERS {
@@ -45,34 +44,25 @@ pub fn run(args: Args) -> Result<(), Failure> {
     }
 }
 
-/// The objects of function 43/14, asked on while more follow.
+/// What the device says of itself, as `busker identify` asks for it.
 fn identification(device: &mut Asked) -> Result<Vec<Finding>, Failure> {
-    let mut findings = Vec::new();
-    let mut object = 0;
-    loop {
-        match device.ask(&Call::ReadIdentification { code: 1, object })? {
-            Ok(Answer::Identification(answer)) => {
-                let objects = answer.objects.into_iter();
-                findings.extend(objects.map(|(number, text)| (object_name(number), Ok(Value::String(text)))));
-                match answer.next {
-                    // Only upwards: a device that begins again would be asked for ever.
-                    Some(next) if next > object => object = next,
-                    _ => return Ok(findings),
-                }
-            }
-            Ok(_) => return Ok(findings),
-            Err(error) => {
-                findings.push(("identification".into(), Err(error)));
-                return Ok(findings);
-            }
-        }
+    let interview = device.interview(Interview::of_device(None, Known::default()))?;
+    let objects = interview.objects().iter();
+    let mut findings: Vec<Finding> =
+        objects.map(|(number, text)| (object_name(*number), Ok(Value::String(text.clone())))).collect();
+    if let Some(error) = interview.objects_error() {
+        findings.push(("identification".into(), Err(error.clone())));
     }
+    if let Some(server_id) = interview.server_id() {
+        let told = server_id.clone().map(|bytes| hexadecimal(&bytes).into());
+        findings.push(("server_id".into(), told));
+    }
+    Ok(findings)
 }
 
 fn told(answer: &Answer) -> Value {
     match answer {
         Answer::Diagnostics(words) => words.first().copied().into(),
-        Answer::ServerId(bytes) => hexadecimal(bytes).into(),
         _ => Value::Null,
     }
 }

@@ -18,12 +18,14 @@ pub mod configuration;
 mod demo;
 mod diagnose;
 mod doctor;
+mod identify;
 pub mod log;
 pub mod output;
 mod plan;
 mod profiles;
 mod read;
 mod run;
+mod scan;
 mod settings;
 mod simulate;
 mod write;
@@ -52,10 +54,12 @@ verbs! {
     diagnose Diagnose,
     demo Demo,
     doctor Doctor,
+    identify Identify,
     plan Plan,
     profiles Profiles,
     read Read,
     run Run,
+    scan Scan,
     settings Settings,
     simulate Simulate,
     write Write,

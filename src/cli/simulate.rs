@@ -51,6 +51,10 @@ pub struct Args {
     /// Let requests and replies take the time that they would take on a wire
     #[arg(long)]
     paced: bool,
+    /// Let the bit rate and parity count that a program sets at the pseudo-terminal, as on a wire: a device with
+    /// others hears noise. Parity is seen of programs that check it (INPCK), as `busker scan` and `busker line` do
+    #[arg(long)]
+    heed_settings: bool,
     /// Keep the EEPROMs in this directory
     #[arg(long, value_name = "DIR")]
     state_dir: Option<PathBuf>,
@@ -110,6 +114,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
         line: LineSettings { baud: args.baud, parity: args.parity },
         turnaround: args.turnaround,
         paced: args.paced,
+        heeds_settings: args.heed_settings,
         state_dir: args.state_dir,
         faults: args.fault,
     };

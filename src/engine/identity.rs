@@ -1,5 +1,11 @@
 //! Whether the device that answers is the one that the profile describes.
 
+mod interview;
+mod proposal;
+
+pub use interview::{Interview, Known, known, nameless};
+pub use proposal::{entry, name_for};
+
 use crate::engine::device::Identify;
 use crate::engine::modbus::{Answer, Call};
 

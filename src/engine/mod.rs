@@ -28,6 +28,7 @@ pub mod schedule;
 
 // Understand: who answers, what is known of it, and what changed.
 pub mod identity;
+pub mod scan;
 pub mod state;
 
 // Tell: topics, discovery, health, what waits for the broker and when to look for it, and what has

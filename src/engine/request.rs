@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde_json::Value as Json;
 
 use crate::engine::address::Span;
-use crate::engine::device::Identify;
+use crate::engine::identity::Known;
 use crate::engine::time::{Date, Duration};
 use crate::engine::topics::{Message, Topics};
 use crate::engine::transaction::Transaction;
@@ -70,8 +70,7 @@ pub enum Wish {
 pub struct Scan {
     pub first: u8,
     pub last: u8,
-    /// Each profile with what its device says of itself.
-    pub known: Arc<Vec<(String, Identify)>>,
+    pub known: Known,
     /// As long as somebody has it, the scan is under way, and the desk takes no other.
     pub ticket: Arc<()>,
 }

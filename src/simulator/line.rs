@@ -189,11 +189,25 @@ impl Line {
         changed
     }
 
-    /// Takes what came over the line, and gives the replies in the order of their times.
-    pub fn hear(&mut self, now: Time, framing: Framing, received: &Received) -> Vec<Transmission> {
+    /// Takes what came over the line, and gives the replies in the order of their times. `sent_with` are the
+    /// settings of who sent it, where those count: a device with others hears only that something was there.
+    pub fn hear(
+        &mut self,
+        now: Time,
+        framing: Framing,
+        received: &Received,
+        sent_with: Option<LineSettings>,
+    ) -> Vec<Transmission> {
         self.advance(now);
+        if let Some(sent_with) = sent_with {
+            let settings = self.settings;
+            let others = self.units.iter_mut().filter(|unit| unit.hears(now));
+            for unit in others.filter(|unit| unit.device.line_settings().unwrap_or(settings) != sent_with) {
+                unit.device.overhear(Overheard::Damaged);
+            }
+        }
         let Received::Frame(frame) = received else {
-            self.listening(now).for_each(|unit| unit.device.overhear(Overheard::Damaged));
+            self.listening(now, sent_with).for_each(|unit| unit.device.overhear(Overheard::Damaged));
             return Vec::new();
         };
         // On Modbus TCP, unit 0 is an ordinary address, and where there is one device it and 255
@@ -206,7 +220,7 @@ impl Line {
         let known = self.units.iter().any(|unit| unit.at.unit == meant);
         let pace = self.pace(framing, frame);
         let mut transmissions = Vec::new();
-        for unit in self.listening(now) {
+        for unit in self.listening(now, sent_with) {
             if broadcast {
                 unit.device.request(now, Addressed::Broadcast, &frame.pdu);
             } else if unit.at.unit == meant {
@@ -233,18 +247,22 @@ impl Line {
         Pace { turnaround: self.turnaround, request_time, per_byte }
     }
 
-    /// The units that have power and settings which fit the line.
-    fn listening(&mut self, now: Time) -> impl Iterator<Item = &mut Unit> {
+    /// The units that have power and settings which fit those of the line, or of who sends on it.
+    fn listening(&mut self, now: Time, sent_with: Option<LineSettings>) -> impl Iterator<Item = &mut Unit> {
         let settings = self.settings;
+        let heard = sent_with.unwrap_or(settings);
         self.units.iter_mut().filter(move |unit| {
-            unit.powered
-                && now >= unit.silent_until
-                && unit.device.line_settings().is_none_or(|own| own == settings)
+            // Those that have none of their own have the line's.
+            unit.hears(now) && unit.device.line_settings().unwrap_or(settings) == heard
         })
     }
 }
 
 impl Unit {
+    fn hears(&self, now: Time) -> bool {
+        self.powered && now >= self.silent_until
+    }
+
     fn restart(&mut self, now: Time) {
         self.device.restart(now);
         self.silent_until = now + BOOT_TIME;

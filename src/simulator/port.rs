@@ -11,9 +11,10 @@ use anyhow::{Context, bail};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+use rustix::termios::{ControlModes, InputModes, OptionalActions, tcgetattr, tcsetattr};
 
 use crate::engine::time::{Duration, Time};
+use crate::simulator::device::{LineSettings, Parity};
 use crate::simulator::line::Transmission;
 use crate::simulator::server::Shared;
 use crate::simulator::wire::{Framing, Received, Receiver};
@@ -85,7 +86,8 @@ impl PtyPort {
         }
         let shared = Arc::clone(&self.shared);
         let thread = Thread::spawn("simulated line", move |stop| {
-            serve(&shared, controller.as_fd(), stop, Framing::Rtu);
+            let counts = shared.heeds_settings;
+            serve(&shared, controller.as_fd(), stop, Framing::Rtu, counts);
         })?;
         self.plugged = Some(Plugged { terminal_path, _terminal: terminal, _thread: thread });
         Ok(())
@@ -127,7 +129,7 @@ impl TcpPort {
                 }
                 let shared = Arc::clone(&shared);
                 let connection = Thread::spawn("simulated connection", move |stop| {
-                    serve(&shared, stream.as_fd(), stop, framing);
+                    serve(&shared, stream.as_fd(), stop, framing, false);
                 });
                 connections.retain(|connection: &Thread| !connection.is_finished());
                 connections.extend(connection.ok());
@@ -194,8 +196,22 @@ fn wait(input: BorrowedFd<'_>, stop: BorrowedFd<'_>, timeout: Option<Duration>) 
     }
 }
 
-/// Reads requests and writes replies at their times, until `stop` or until the peer is gone.
-fn serve(shared: &Shared, stream: BorrowedFd<'_>, stop: BorrowedFd<'_>, framing: Framing) {
+/// What the program at the other side of a pseudo-terminal has set. Linux takes the flag of the parity itself
+/// away there; whether it is checked stays, and says it for programs that check it.
+fn settings_at(controller: BorrowedFd<'_>) -> Option<LineSettings> {
+    let attributes = tcgetattr(controller).ok()?;
+    let is_checked = attributes.input_modes.contains(InputModes::INPCK);
+    let parity = match (is_checked, attributes.control_modes.contains(ControlModes::PARODD)) {
+        (false, _) => Parity::None,
+        (true, false) => Parity::Even,
+        (true, true) => Parity::Odd,
+    };
+    Some(LineSettings { baud: attributes.output_speed(), parity })
+}
+
+/// Reads requests and writes replies at their times, until `stop` or until the peer is gone. `counts`: with which
+/// settings a request was sent.
+fn serve(shared: &Shared, stream: BorrowedFd<'_>, stop: BorrowedFd<'_>, framing: Framing, counts: bool) {
     let mut receiver = Receiver::new(framing, shared.line_settings());
     let mut outgoing: VecDeque<Transmission> = VecDeque::new();
     let mut buffer = [0; 512];
@@ -213,7 +229,8 @@ fn serve(shared: &Shared, stream: BorrowedFd<'_>, stop: BorrowedFd<'_>, framing:
             },
         }
         while let Some(received) = receiver.next(shared.clock.now()) {
-            outgoing.extend(shared.hear(framing, &received));
+            let settings = if counts { settings_at(stream) } else { None };
+            outgoing.extend(shared.hear(framing, &received, settings));
             outgoing.make_contiguous().sort_by_key(|transmission| transmission.at);
             if received == Received::NotModbus {
                 return;

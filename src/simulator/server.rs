@@ -37,6 +37,9 @@ pub struct Options {
     pub turnaround: Duration,
     /// Whether requests and replies take the time that they would take on a wire of this bit rate.
     pub paced: bool,
+    /// Whether the bit rate and parity that a program sets at a pseudo-terminal count, as on a wire: a device
+    /// with others hears noise.
+    pub heeds_settings: bool,
     /// Where the EEPROMs are kept; `None`: they are forgotten at the end.
     pub state_dir: Option<PathBuf>,
     pub faults: Vec<Fault>,
@@ -48,6 +51,7 @@ impl Default for Options {
             line: LineSettings::default(),
             turnaround: Duration::from_millis(5),
             paced: false,
+            heeds_settings: false,
             state_dir: None,
             faults: Vec::new(),
         }
@@ -117,6 +121,7 @@ impl Simulation {
         line.changed_outputs();
         let shared = Arc::new(Shared {
             clock,
+            heeds_settings: options.heeds_settings,
             state: Mutex::new(State {
                 line,
                 store,
@@ -220,6 +225,7 @@ impl fmt::Display for Told {
 /// What the doors and the clockwork share.
 pub(super) struct Shared {
     pub(super) clock: Clock,
+    pub(super) heeds_settings: bool,
     state: Mutex<State>,
     wake: Condvar,
 }
@@ -244,9 +250,14 @@ impl Shared {
     }
 
     /// Takes what came through a door, and gives what goes back through it.
-    pub(super) fn hear(&self, framing: Framing, received: &Received) -> Vec<Transmission> {
+    pub(super) fn hear(
+        &self,
+        framing: Framing,
+        received: &Received,
+        sent_with: Option<LineSettings>,
+    ) -> Vec<Transmission> {
         let mut state = self.lock();
-        let transmissions = state.line.hear(self.clock.now(), framing, received);
+        let transmissions = state.line.hear(self.clock.now(), framing, received, sent_with);
         state.settle();
         transmissions
     }

@@ -3,10 +3,12 @@
 
 mod by_hand;
 mod doctor;
+mod identify;
 mod pcapng;
 #[path = "../support/peer.rs"]
 mod peer;
 mod recorder;
+mod scan;
 #[path = "../support/mod.rs"]
 mod support;
 

@@ -246,7 +246,7 @@ impl World {
     /// Hands the devices the request that has come whole.
     fn listen(&mut self) {
         if let Some(received) = self.receiver.next(self.now) {
-            let answers = self.line.hear(self.now, self.framing, &received);
+            let answers = self.line.hear(self.now, self.framing, &received, None);
             self.owe(answers);
         }
     }

@@ -48,6 +48,16 @@ impl Link {
         }
     }
 
+    /// The same for who wants to know whether the settings are right: what comes with another parity is
+    /// damaged.
+    pub fn open_strict(settings: &settings::Link) -> Result<Link, Lost> {
+        let link = Link::open(settings)?;
+        if let (Link::Serial(port), settings::Link::Serial { line, .. }) = (&link, settings) {
+            port.check_parity(line.parity).map_err(|error| Lost(error.to_string()))?;
+        }
+        Ok(link)
+    }
+
     /// Reads what is there: `None` when nothing is.
     pub fn read(&self, buffer: &mut [u8]) -> Result<Option<usize>, Lost> {
         match rustix::io::read(self.as_fd(), buffer) {

@@ -38,6 +38,16 @@ impl Port {
     }
 }
 
+impl Port {
+    /// From here on a byte whose parity is wrong is read as 0, and spoils its frame. Otherwise a device with
+    /// another parity, which does not check ours, would be heard as if it had the right one.
+    pub fn check_parity(&self, parity: Parity) -> Result<(), Errno> {
+        let mut settings = termios::tcgetattr(&self.descriptor)?;
+        settings.input_modes.set(InputModes::INPCK, parity != Parity::None);
+        termios::tcsetattr(&self.descriptor, OptionalActions::Now, &settings)
+    }
+}
+
 impl AsFd for Port {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.descriptor.as_fd()

@@ -227,7 +227,7 @@ enum Purpose {
     BeatWrite(PointIndex),
     /// A question of the request that has begun.
     Request,
-    Scan(Call),
+    Scan,
 }
 
 impl Bus {
@@ -449,8 +449,8 @@ impl Bus {
     }
 
     fn request_ended(&mut self, in_flight: InFlight, result: Result<Answer, RequestError>) {
-        if let Purpose::Scan(call) = &in_flight.purpose {
-            return self.scan_answered(call, in_flight.sent_at, &result);
+        if matches!(in_flight.purpose, Purpose::Scan) {
+            return self.scan_answered(in_flight.sent_at, &result);
         }
         let Some(index) = in_flight.device else { return };
         let device = &mut self.devices[index];
@@ -477,7 +477,7 @@ impl Bus {
             }
             Purpose::Request => self.request_answered(in_flight.sent_at, result),
             // Has been seen to.
-            Purpose::Scan(_) => {}
+            Purpose::Scan => {}
         }
     }
 

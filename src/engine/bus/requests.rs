@@ -123,7 +123,7 @@ impl Flow {
         match self {
             Flow::Read(read) => read.begin(),
             Flow::Write(write) => write.begin(device),
-            Flow::Identify(identification) => identification.begin(),
+            Flow::Identify(identification) => identification.begin(device),
             Flow::Diagnose(diagnosis) => diagnosis.begin(),
         }
     }
@@ -142,7 +142,7 @@ impl Bus {
                 Ok(Flow::Write(RawWrite::new(span, words, state)?))
             }),
             Wish::Identify { device } => {
-                self.wait(request, &device, |_| Ok(Flow::Identify(Identification::default())));
+                self.wait(request, &device, |state| Ok(Flow::Identify(Identification::new(state))));
             }
             Wish::Diagnostics { device } => {
                 self.wait(request, &device, |_| Ok(Flow::Diagnose(Diagnosis::default())));
@@ -244,7 +244,7 @@ impl Bus {
         let progress = match &mut flow {
             Flow::Read(read) => read.answered(self.now, state, result, &mut self.context),
             Flow::Write(write) => write.answered(self.now, state, result, &mut self.context),
-            Flow::Identify(identification) => identification.answered(state, result),
+            Flow::Identify(identification) => identification.answered(state, &result),
             Flow::Diagnose(diagnosis) => diagnosis.answered(state, result),
         };
         self.go_on(request, device, flow, progress);

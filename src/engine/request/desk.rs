@@ -10,7 +10,7 @@ use super::object::{Object, transaction_of, words};
 use super::{Request, Scan, Status, Verb, Wish, answer};
 use crate::engine::arrivals::{Command, Errand};
 use crate::engine::command::{self, Outcome, OutcomeKind};
-use crate::engine::device::Identify;
+use crate::engine::identity::{self, Known};
 use crate::engine::profile::Library;
 use crate::engine::settings::{Link, Settings};
 use crate::engine::time::{Date, Duration};
@@ -50,7 +50,7 @@ pub struct Desk {
     buses: Vec<(String, bool)>,
     library: Library,
     /// The identifications in the library, once somebody has wanted them.
-    known: Option<Arc<Vec<(String, Identify)>>>,
+    known: Option<Known>,
     /// Of the last scan.
     ticket: Weak<()>,
     /// Verbs of which a retained request has been seen.
@@ -245,12 +245,9 @@ impl Desk {
         }
     }
 
-    fn known(&mut self) -> Arc<Vec<(String, Identify)>> {
+    fn known(&mut self) -> Known {
         let library = &self.library;
-        let identify = |id: &str| Some((id.to_string(), library.load(id).ok()?.identify?));
-        self.known
-            .get_or_insert_with(|| Arc::new(library.ids().into_iter().filter_map(identify).collect()))
-            .clone()
+        self.known.get_or_insert_with(|| identity::known(library)).clone()
     }
 }
 

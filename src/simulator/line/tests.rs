@@ -24,7 +24,7 @@ impl Table {
 
     fn ask(&mut self, unit: u8, pdu: &[u8]) -> Vec<Transmission> {
         let frame = Frame { transaction: 7, unit, pdu: pdu.to_vec() };
-        self.line.hear(self.now, self.framing, &Received::Frame(frame))
+        self.line.hear(self.now, self.framing, &Received::Frame(frame), None)
     }
 }
 
@@ -85,7 +85,7 @@ fn a_restart_on_request_is_followed_by_two_seconds_of_silence() {
 #[test]
 fn a_damaged_frame_is_counted_by_every_device_and_answered_by_none() {
     let mut table = Table::new(Framing::Rtu);
-    assert_eq!(table.line.hear(table.now, Framing::Rtu, &Received::Damaged), []);
+    assert_eq!(table.line.hear(table.now, Framing::Rtu, &Received::Damaged, None), []);
     assert_eq!(table.ask(20, &[8, 0, 12, 0, 0])[0].bytes, rtu(20, &[8, 0, 12, 0, 1]));
 }
 

@@ -3,145 +3,53 @@
 use serde_json::{Map, Value as Json, json};
 
 use crate::engine::bus::device::DeviceState;
-use crate::engine::device::Identify;
-use crate::engine::identity;
-use crate::engine::modbus::names::{COUNTERS, QUERY, hexadecimal, object_name};
-use crate::engine::modbus::{self, Answer, Call, RequestError};
+use crate::engine::identity::{Interview, Known};
+use crate::engine::modbus::names::{COUNTERS, QUERY};
+use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::request::Status;
 
 use super::Progress;
 
 /// All objects of function 43/14, the server id of function 17, and what the profile goes by.
-pub(super) struct Identification {
-    step: Step,
-    /// Objects so far; the profile's check wants them too.
-    objects: Vec<(u8, String)>,
-    server_id: Json,
-    /// Why the objects end.
-    error: Option<RequestError>,
-    heard: bool,
-}
-
-enum Step {
-    /// 1 basic, 2 regular, 3 extended, from this object on.
-    Objects {
-        code: u8,
-        object: u8,
-    },
-    ServerId,
-    Register,
-}
-
-impl Default for Identification {
-    fn default() -> Identification {
-        Identification {
-            step: Step::Objects { code: 1, object: 0 },
-            objects: Vec::new(),
-            server_id: Json::Null,
-            error: None,
-            heard: false,
-        }
-    }
-}
+pub(super) struct Identification(Interview);
 
 impl Identification {
-    pub(super) fn begin(&self) -> Progress {
-        Progress::Ask(Call::ReadIdentification { code: 1, object: 0 })
+    pub(super) fn new(device: &DeviceState) -> Identification {
+        Identification(Interview::of_device(device.device().identify.clone(), Known::default()))
+    }
+
+    pub(super) fn begin(&self, device: &DeviceState) -> Progress {
+        self.0.question().map_or_else(|| self.ended(device), Progress::Ask)
     }
 
     pub(super) fn answered(
         &mut self,
         device: &DeviceState,
-        result: Result<Answer, RequestError>,
+        result: &Result<Answer, RequestError>,
     ) -> Progress {
-        // A refusal is an answer, silence is not.
-        self.heard |= matches!(result, Ok(_) | Err(RequestError::Exception(_)));
-        match self.step {
-            Step::Objects { code, object } => {
-                let next = match result {
-                    Ok(Answer::Identification(found)) => self.take_objects(code, object, found),
-                    Ok(_) => None,
-                    Err(error) => {
-                        self.error = Some(error);
-                        None
-                    }
-                };
-                match next {
-                    Some((code, object)) => {
-                        self.step = Step::Objects { code, object };
-                        Progress::Ask(Call::ReadIdentification { code, object })
-                    }
-                    None => {
-                        self.step = Step::ServerId;
-                        Progress::Ask(Call::ReportServerId)
-                    }
-                }
-            }
-            Step::ServerId => {
-                self.server_id = match result {
-                    Ok(Answer::ServerId(bytes)) => hexadecimal(&bytes).into(),
-                    Ok(_) => Json::Null,
-                    Err(error) => json!({"error": error.to_string()}),
-                };
-                match &device.device().identify {
-                    Some(identify @ Identify::Word { .. }) => {
-                        self.step = Step::Register;
-                        Progress::Ask(identity::question(identify))
-                    }
-                    Some(identify @ Identify::Names { .. }) => {
-                        let objects = self.objects.clone();
-                        let basic = modbus::Identification { conformity: 1, next: None, objects };
-                        let checked = match &self.error {
-                            Some(error) if self.objects.is_empty() => Err(error.to_string()),
-                            _ => identity::check(identify, &Answer::Identification(basic)),
-                        };
-                        self.ended(device, Some(checked))
-                    }
-                    None => self.ended(device, None),
-                }
-            }
-            Step::Register => {
-                let checked = match (result, &device.device().identify) {
-                    (Ok(answer), Some(identify)) => identity::check(identify, &answer),
-                    (Err(error), _) => Err(error.to_string()),
-                    (Ok(_), None) => Err("the profile goes by nothing".into()),
-                };
-                self.ended(device, Some(checked))
-            }
-        }
+        self.0.answered(result);
+        self.begin(device)
     }
 
-    /// Keeps what came; returns where to go on, only ever upwards, so that it ends.
-    fn take_objects(&mut self, code: u8, object: u8, found: modbus::Identification) -> Option<(u8, u8)> {
-        self.objects.extend(found.objects.into_iter().filter(|(number, _)| *number >= object));
-        if let Some(next) = found.next.filter(|next| *next > object) {
-            return Some((code, next));
-        }
-        // The highest level that the device claims; bit 7 says that single objects may be asked for.
-        match (code, found.conformity & 0x7F) {
-            (1, 2 | 3) => Some((2, 3)),
-            (2, 3) => Some((3, 0x80)),
-            _ => None,
-        }
-    }
-
-    fn ended(&self, device: &DeviceState, checked: Option<Result<String, String>>) -> Progress {
-        let objects: Map<String, Json> =
-            self.objects.iter().map(|(number, text)| (object_name(*number), text.clone().into())).collect();
+    fn ended(&self, device: &DeviceState) -> Progress {
+        let Identification(interview) = self;
+        let device_profile = device.device();
+        let id = &device_profile.profile;
+        let checked = device_profile.identify.as_ref().map(|identify| interview.check(identify));
         let profile = match checked {
-            None => json!({"id": device.device().profile, "matches": null, "reason": "it goes by nothing"}),
-            Some(Ok(found)) => json!({"id": device.device().profile, "matches": true, "found": found}),
-            Some(Err(reason)) => json!({"id": device.device().profile, "matches": false, "reason": reason}),
+            None => json!({"id": id, "matches": null, "reason": "it goes by nothing"}),
+            Some(Ok(found)) => json!({"id": id, "matches": true, "found": found}),
+            Some(Err(reason)) => json!({"id": id, "matches": false, "reason": reason}),
         };
-        let error = self.error.as_ref().map(RequestError::to_string);
+        let error = interview.objects_error().map(RequestError::to_string);
         let data = json!({
             "device": device.name(),
-            "objects": objects,
+            "objects": interview.objects_json(),
             "objects_error": error,
-            "server_id": self.server_id,
+            "server_id": interview.server_id_json(),
             "profile": profile,
         });
-        if self.heard {
+        if interview.was_heard() {
             return Progress::done(data);
         }
         let error = error.unwrap_or_else(|| RequestError::Timeout.to_string());

@@ -1,0 +1,399 @@
+//! `busker scan`: who answers on a line, and how that would stand in the configuration.
+
+use std::io::{IsTerminal, Write};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::anyhow;
+
+use super::by_hand::host_and_port;
+use super::{Failure, output};
+use crate::edge::clock::Clock;
+use crate::edge::guarded_link::GuardedLink;
+use crate::edge::link::{Link, Lost, adapter};
+use crate::edge::shutdown::{Heard, Signals};
+use crate::engine::identity;
+use crate::engine::modbus::guard::Guard;
+use crate::engine::profile::Library;
+use crate::engine::scan::{self, Place, Progress, Question, Report, Scan, Wanted};
+use crate::engine::settings::{self, Line, Parity, Rs485};
+use crate::engine::time::{Duration, Time};
+use crate::engine::yaml::Scalar;
+
+/// Find the devices on a line, and propose a configuration for them
+///
+/// Asks each unit who it is, and writes nothing. Of a serial line the bit rate and parity are found as
+/// well: the likeliest first, slow ones last; once a unit has answered, all are asked with its settings.
+/// Nobody else may speak on the line meanwhile: stop the service first. Ctrl-C ends it with what was
+/// found so far. What is printed can stand in the configuration as it is.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  busker scan --serial /dev/ttyUSB0
+  busker scan --serial /dev/ttyUSB0 --baud 19200 --parity even --units 1..32
+  busker scan --tcp 192.168.1.20:502 --json")]
+pub struct Args {
+    #[command(flatten)]
+    line: WhichLine,
+    /// The units to ask: `1..32`, `7`, or several of them with commas [default: 1..247, and 255 on Modbus TCP]
+    #[arg(long, value_name = "UNITS", value_parser = units)]
+    units: Option<Units>,
+    /// The line's bit rate, where it is known
+    #[arg(long, value_name = "RATE", value_parser = clap::value_parser!(u32).range(300..=1_000_000), conflicts_with = "tcp")]
+    baud: Option<u32>,
+    /// The line's parity, where it is known: even, odd or none
+    #[arg(long, value_parser = <Parity as Scalar>::parse, conflicts_with = "tcp")]
+    parity: Option<Parity>,
+    /// The line's stop bits, where they are known: 1 or 2
+    #[arg(long, value_parser = clap::value_parser!(u8).range(1..=2), conflicts_with = "tcp")]
+    stop_bits: Option<u8>,
+    /// How long to wait for a unit that may not be there [default: 60 ms and five characters on a line, where what
+    /// comes later is still noticed; 1s on Modbus TCP]
+    #[arg(long, value_name = "TIME", value_parser = <Duration as Scalar>::parse)]
+    timeout: Option<Duration>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, clap::Args)]
+#[group(required = true, multiple = false)]
+struct WhichLine {
+    /// RTU on this serial port
+    #[arg(long, value_name = "PORT")]
+    serial: Option<String>,
+    /// Modbus TCP at this address; without a port 502
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    tcp: Option<String>,
+    /// RTU through a serial server at this address, which has bit rate and parity of its own
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    rtu_over_tcp: Option<String>,
+}
+
+#[derive(Clone, Debug)]
+struct Units(Vec<u8>);
+
+/// Reads `1..32,40`.
+fn units(text: &str) -> Result<Units, String> {
+    let mut units = Vec::new();
+    for part in text.split(',') {
+        let (first, last) = part.split_once("..").unwrap_or((part, part));
+        match (first.trim().parse::<u8>(), last.trim().parse::<u8>()) {
+            (Ok(first), Ok(last)) if 1 <= first && first <= last => units.extend(first..=last),
+            _ => return Err(format!("`{part}` names no units; expected them as in `1..32` or `7`")),
+        }
+    }
+    units.sort_unstable();
+    units.dedup();
+    Ok(Units(units))
+}
+
+pub fn run(args: Args) -> Result<(), Failure> {
+    let library = Library::shipped();
+    let site = args.site()?;
+    let wanted = Wanted {
+        lines: args.lines(),
+        units: args.units()?,
+        known: identity::known(&library),
+        nameless: identity::nameless(&library),
+        timeout: args.timeout,
+    };
+    let interrupted = interrupted()?;
+    let mut scan = Scan::new(wanted);
+    let mut edge = Edge { site, clock: Clock::start(), open: None };
+    // What cannot be opened at all is told before anything is promised.
+    if let Err(Lost(why)) = edge.open(scan.progress().line) {
+        return Err(anyhow!("{why}").into());
+    }
+    eprintln!("{}", promise(&scan, &edge.site.shown));
+    let mut teller = Teller::new(edge.clock);
+    let ended = edge.scan(&mut scan, &mut teller, &interrupted);
+    teller.end();
+    if matches!(ended, Ended::Interrupted) {
+        eprintln!("interrupted; what was found so far:");
+    }
+    let report = scan.report(matches!(ended, Ended::Whole));
+    tell(&report, &edge.site.place, args.json)?;
+    match ended {
+        Ended::Lost(Lost(why)) => Err(anyhow!("the scan ended early: {why}").into()),
+        _ if report.is_empty() => Err(anyhow!("{}", report.why_empty()).into()),
+        _ => Ok(()),
+    }
+}
+
+fn tell(report: &Report, place: &Place, as_json: bool) -> Result<(), Failure> {
+    if as_json {
+        return output::print_json(&report.json(place));
+    }
+    report.notes().iter().for_each(|note| eprintln!("note: {note}"));
+    report.configuration(place).map_or(Ok(()), |text| output::print(&text))
+}
+
+/// What is scanned.
+struct Site {
+    place: Place,
+    link: settings::Link,
+    shown: String,
+}
+
+impl Args {
+    fn site(&self) -> Result<Site, Failure> {
+        let line = self.lines().first().copied().unwrap_or(scan::SPECIFIED);
+        let (place, link, shown) = match (&self.line.serial, &self.line.tcp, &self.line.rtu_over_tcp) {
+            (Some(path), ..) => {
+                // The name that stays with the adapter.
+                let stable = adapter::stable_path(Path::new(path), Path::new(adapter::BY_ID));
+                let lasting = stable.map_or_else(|| path.clone(), |path| path.display().to_string());
+                let link = settings::Link::Serial { path: path.clone(), line, rs485: Rs485::Auto };
+                (Place::Serial(lasting), link, path.clone())
+            }
+            (_, Some(address), _) => {
+                let (host, port) = host_and_port(address)?;
+                let address = format!("{}:{port}", bracketed(&host));
+                (Place::Tcp(address.clone()), settings::Link::Tcp { host, port }, address)
+            }
+            (.., address) => {
+                let (host, port) = host_and_port(address.as_deref().unwrap_or_default())?;
+                let address = format!("{}:{port}", bracketed(&host));
+                let link = settings::Link::RtuOverTcp { host, port, line };
+                (Place::RtuOverTcp(address.clone()), link, address)
+            }
+        };
+        Ok(Site { place, link, shown })
+    }
+
+    /// The settings to try: behind a server only its own, which nobody here can change.
+    fn lines(&self) -> Vec<Line> {
+        let lines = scan::lines(self.baud, self.parity, self.stop_bits);
+        match (&self.line.serial, &self.line.rtu_over_tcp) {
+            (Some(_), _) => lines,
+            (_, Some(_)) => lines.into_iter().take(1).collect(),
+            _ => Vec::new(),
+        }
+    }
+
+    fn units(&self) -> Result<Vec<u8>, Failure> {
+        let of_tcp = self.line.tcp.is_some();
+        match &self.units {
+            None => Ok((1..=247).chain(of_tcp.then_some(255)).collect()),
+            Some(Units(units)) => match units.iter().find(|unit| **unit > 247 && !of_tcp) {
+                Some(unit) => {
+                    Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")))
+                }
+                None => Ok(units.clone()),
+            },
+        }
+    }
+}
+
+/// An address of version 6 in brackets, as it stands before a port.
+fn bracketed(host: &str) -> String {
+    if host.contains(':') { format!("[{host}]") } else { host.into() }
+}
+
+/// How it ended.
+enum Ended {
+    Whole,
+    Interrupted,
+    Lost(Lost),
+}
+
+/// What does the asking.
+struct Edge {
+    site: Site,
+    clock: Clock,
+    /// The link with the settings that it was opened with.
+    open: Option<(Option<Line>, GuardedLink)>,
+}
+
+impl Edge {
+    fn scan(&mut self, scan: &mut Scan, teller: &mut Teller, interrupted: &AtomicBool) -> Ended {
+        while let Some(question) = scan.next_question() {
+            if interrupted.load(Ordering::Relaxed) {
+                return Ended::Interrupted;
+            }
+            match self.ask(&question) {
+                Ok(reply) => scan.answered(&reply),
+                Err(Asking::Refused(line, why)) => scan.refuse_line(line, &why),
+                Err(Asking::Lost(lost)) => return Ended::Lost(lost),
+            }
+            while let Some(news) = scan.next_news() {
+                teller.say(&news);
+            }
+            teller.progress(&scan.progress());
+        }
+        Ended::Whole
+    }
+
+    fn ask(&mut self, question: &Question) -> Result<crate::engine::modbus::Reply, Asking> {
+        let before = self.open.as_ref().map(|(line, _)| *line);
+        if before != Some(question.line) {
+            // First, since a port is open only once.
+            self.open = None;
+            if let Err(Lost(why)) = self.open(question.line) {
+                // Where it still opens as before, it is these settings that it does not take.
+                let opens = before.is_some_and(|before| self.open(before).is_ok());
+                return Err(match question.line.filter(|_| opens) {
+                    Some(line) => Asking::Refused(line, why),
+                    None => Asking::Lost(Lost(why)),
+                });
+            }
+        }
+        let Some((_, link)) = &mut self.open else {
+            return Err(Asking::Lost(Lost("the link is not open".into())));
+        };
+        // A gateway may close a connection; the next one is as good.
+        match (link.ask(&question.request, question.timeout), &self.site.link) {
+            (Ok(reply), _) => Ok(reply),
+            (Err(_), settings::Link::Tcp { .. }) => {
+                self.open = None;
+                self.open(question.line).map_err(Asking::Lost)?;
+                let link = self.open.as_mut().map(|(_, link)| link);
+                let asked = link.map(|link| link.ask(&question.request, question.timeout));
+                asked.unwrap_or_else(|| Err(Lost("the link is not open".into()))).map_err(Asking::Lost)
+            }
+            (Err(lost), _) => Err(Asking::Lost(lost)),
+        }
+    }
+
+    fn open(&mut self, line: Option<Line>) -> Result<(), Lost> {
+        let mut link = self.site.link.clone();
+        if let (
+            settings::Link::Serial { line: set, .. } | settings::Link::RtuOverTcp { line: set, .. },
+            Some(line),
+        ) = (&mut link, line)
+        {
+            *set = line;
+        }
+        let guarded = GuardedLink::new(Link::open_strict(&link)?, Guard::new(&link, None), self.clock);
+        self.open = Some((line, guarded));
+        Ok(())
+    }
+}
+
+/// Why a question has no reply.
+enum Asking {
+    Refused(Line, String),
+    Lost(Lost),
+}
+
+/// What the whole takes, beforehand.
+fn promise(scan: &Scan, place: &str) -> String {
+    let (best, most) = (duration(scan.at_best()), duration(scan.at_most()));
+    let settings = scan.settings();
+    match settings {
+        0 | 1 => format!(
+            "asking {} units on {place}: at most {most}; Ctrl-C ends it with what was found",
+            scan.units()
+        ),
+        _ => format!(
+            "asking {} units on {place} with up to {settings} settings, the likeliest first: about {best} once one \
+             has answered, at most {most} if none does; Ctrl-C ends it with what was found",
+            scan.units()
+        ),
+    }
+}
+
+/// `40 s`, `12 min`
+fn duration(time: Duration) -> String {
+    match time.as_secs() {
+        0 => "1 s".into(),
+        seconds @ 1..=99 => format!("{seconds} s"),
+        seconds => format!("{} min", seconds.div_ceil(60)),
+    }
+}
+
+/// Turns true when somebody interrupts.
+fn interrupted() -> anyhow::Result<Arc<AtomicBool>> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let mut signals = runtime.block_on(async { Signals::listen() })?;
+    let interrupted = Arc::new(AtomicBool::new(false));
+    let told = Arc::clone(&interrupted);
+    std::thread::Builder::new().name("signals".into()).spawn(move || {
+        // A terminal that is closed ends it as well.
+        let (Heard::Stop(_) | Heard::Reload) = runtime.block_on(signals.wait());
+        told.store(true, Ordering::Relaxed);
+    })?;
+    Ok(interrupted)
+}
+
+/// Tells on standard error how far the scan is: on a terminal in one line that changes, elsewhere seldom.
+struct Teller {
+    clock: Clock,
+    on_terminal: bool,
+    begun: Time,
+    told_at: Time,
+    /// How long the line on the terminal is.
+    shown: usize,
+}
+
+const ON_A_TERMINAL: Duration = Duration::from_millis(200);
+const ELSEWHERE: Duration = Duration::from_secs(30);
+
+impl Teller {
+    fn new(clock: Clock) -> Teller {
+        let now = clock.now();
+        Teller { clock, on_terminal: std::io::stderr().is_terminal(), begun: now, told_at: now, shown: 0 }
+    }
+
+    fn progress(&mut self, progress: &Progress) {
+        let now = self.clock.now();
+        let every = if self.on_terminal { ON_A_TERMINAL } else { ELSEWHERE };
+        if now < self.told_at + every {
+            return;
+        }
+        self.told_at = now;
+        let rate = f64::from(progress.questions) / (now - self.begun).as_secs_f64().max(0.001);
+        let at = progress.line.map_or_else(String::new, |line| format!(" at {line}"));
+        let unit = progress.unit.map_or_else(String::new, |unit| format!("unit {unit}"));
+        let text =
+            format!("{unit}{at}, {rate:.1} questions a second, at most {} more", duration(progress.at_most));
+        if self.on_terminal {
+            self.replace(&text);
+        } else {
+            eprintln!("{text}");
+        }
+    }
+
+    fn say(&mut self, text: &str) {
+        self.end();
+        eprintln!("{text}");
+    }
+
+    /// Takes the changing line away.
+    fn end(&mut self) {
+        if self.shown > 0 {
+            self.replace("");
+            self.shown = 0;
+        }
+    }
+
+    fn replace(&mut self, text: &str) {
+        let width = self.shown;
+        // Whoever cannot be told loses nothing but this.
+        let _ = write!(std::io::stderr(), "\r{text:<width$}{}", if text.is_empty() { "\r" } else { "" });
+        self.shown = text.chars().count();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn units_are_spans_and_single_ones() {
+        let read = |text: &str| units(text).map(|Units(units)| units);
+        assert_eq!(read("7"), Ok(vec![7]));
+        assert_eq!(read("30..32, 1..2,31"), Ok(vec![1, 2, 30, 31, 32]));
+        for wrong in ["", "0", "5..3", "1..300", "all"] {
+            assert!(read(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_time_is_told_as_people_do() {
+        for (seconds, told) in [(0, "1 s"), (99, "99 s"), (100, "2 min"), (600, "10 min")] {
+            assert_eq!(duration(Duration::from_secs(seconds)), told);
+        }
+    }
+}
