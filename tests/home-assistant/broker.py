@@ -62,9 +62,9 @@ class Broker:
         self.process.kill()
         self.process.wait(PATIENCE)
 
-    def was_away(self, at: float, behind: float) -> bool:
-        """Whether it was away at this time, or not long before it."""
-        return any(since <= at <= until + behind for since, until in self.absences)
+    def absence(self, at: float, behind: float) -> float | None:
+        """Since when it was away at this time, or not long before it."""
+        return max((since for since, until in self.absences if since <= at <= until + behind), default=None)
 
     def publish(self, messages: dict[str, str]) -> None:
         """As somebody else, retained; an empty text takes a message back."""

@@ -35,8 +35,9 @@ BROKER_IS_AWAY = re.compile(
     r"|ERROR homeassistant: Error doing job: Task exception was never retrieved \(None\) \(HomeAssistantError\('mqtt_broker_error'\)\)"
     r")"
 )
-# Its thread may say so a little later.
-A_LITTLE = 1
+# It may say so later, where it has other things to do; but each time that the broker goes it loses the connection once.
+LATER = 10
+LOST = re.compile(r".*mqtt\.client: Error returned from MQTT server: The connection was lost\.")
 # What it had asked for when the broker went is not answered; it says so after ten seconds.
 NEVER_ANSWERED = re.compile(r".*mqtt\.client: No ACK from MQTT server in 10 seconds .*")
 
@@ -168,7 +169,10 @@ class House:
 
     def log_is_empty(self) -> None:
         """But for what Home Assistant says of its broker and its machine, and of itself."""
-        reasons = [(self.reason(at, line), line) for at, line in self.home.log()]
+        lines = self.home.log()
+        losses = [self.broker.absence(at, LATER) for at, line in lines if LOST.fullmatch(line)]
+        same([since for since in losses if losses.count(since) > 1], [], "when the broker went once, and more than one loss was logged")
+        reasons = [(self.reason(at, line), line) for at, line in lines]
         log = [line for reason, line in reasons if reason is None] + self.home.ask("issues")
         same(log, [], "Home Assistant's log")
         same([line for line in self.gateway.log().splitlines() if " ERROR " in line or "panicked" in line], [], "busker's own log")
@@ -176,9 +180,9 @@ class House:
 
     def reason(self, at: float, line: str) -> str | None:
         """Why this line of Home Assistant's log is nothing that busker has to do with; `None`: it may be."""
-        if BROKER_IS_AWAY.fullmatch(line) and self.broker.was_away(at, A_LITTLE):
+        if BROKER_IS_AWAY.fullmatch(line) and self.broker.absence(at, LATER):
             return "the broker that is away"
-        if NEVER_ANSWERED.fullmatch(line) and self.broker.was_away(at, 10 + A_LITTLE):
+        if NEVER_ANSWERED.fullmatch(line) and self.broker.absence(at, 10 + LATER):
             return "the broker that is away"
         if IS_SLOW.fullmatch(line) or NEVER_ANSWERED.fullmatch(line):
             return "a slow machine"

@@ -15,6 +15,10 @@ standard input is a command with a `do`; each gets one line of answer on standar
     {"do": "call", "service": "switch.turn_on", "entity": ID, "data": {…}}
     {"do": "enable"}                      as a user enables every entity that is disabled; says how many. What
                                           comes after that comes enabled, so that nothing has to be set up anew
+    {"do": "set_up_anew"}                 sets up the MQTT integration anew
+    {"do": "load", "begins": true}        from now on the platforms' schemas are as they are for a moment while a thread
+                                          loads one more platform, until `begins` is false; says how many of their
+                                          parts that touches
     {"do": "personalize", "entity": ID, "name": NAME, "entity_id": ENTITY_ID}
                                           as a user gives an entity his own name and id
     {"do": "services"}                    the services of each domain that the MQTT entities have
@@ -36,7 +40,7 @@ import sys
 
 from homeassistant import bootstrap, config_entries, core, loader, runner
 from homeassistant.components import binary_sensor, switch
-from homeassistant.components.mqtt import client as mqtt_client, entity as mqtt_entity
+from homeassistant.components.mqtt import client as mqtt_client, entity as mqtt_entity, schemas
 from homeassistant.components.number import const as number_platform
 from homeassistant.components.sensor import const as sensor
 from homeassistant.const import EVENT_STATE_CHANGED, __version__
@@ -71,6 +75,8 @@ class Probe:
     def __init__(self, hass: core.HomeAssistant) -> None:
         self.hass = hass
         self.changed = asyncio.Event()
+        # What was taken from the schemas.
+        self.checks: list[tuple] = []
         hass.bus.async_listen(EVENT_STATE_CHANGED, self.notice)
         hass.bus.async_listen(entity_registry.EVENT_ENTITY_REGISTRY_UPDATED, self.notice)
 
@@ -180,6 +186,21 @@ class Probe:
             registry.async_update_entity(entity_id, disabled_by=None)
         return len(disabled)
 
+    async def set_up_anew(self, _: dict) -> None:
+        await self.hass.config_entries.async_reload("mqtt")
+
+    async def load(self, command: dict) -> int:
+        """A platform's schema takes in what all have in common. Voluptuous then compiles those parts anew, in their place and
+        from nothing, whoever uses them meanwhile; what took its place in newer versions does not."""
+        for part, checks in self.checks:
+            part._compiled = checks
+        self.checks = []
+        if command["begins"] and schemas.vol.__name__ == "voluptuous":
+            self.checks = [(part, part._compiled) for part in shared_parts(schemas.MQTT_ENTITY_COMMON_SCHEMA.schema)]
+            for part, _ in self.checks:
+                part._compiled = []
+        return len(self.checks)
+
     async def personalize(self, command: dict) -> None:
         entry = self.registered()[command["entity"]]
         entity_registry.async_get(self.hass).async_update_entity(
@@ -215,6 +236,18 @@ class Probe:
                 tell({"is": await getattr(self, command["do"])(command)})
             except Exception as fault:  # noqa: BLE001: whatever it is, the test is to say it
                 tell({"failed": f"{type(fault).__name__}: {fault}"})
+
+
+def shared_parts(schema) -> list:
+    """The parts of a schema that are made of others, such as `vol.All`."""
+    if isinstance(schema, schemas.vol.Schema):
+        return shared_parts(schema.schema)
+    if isinstance(schema, (dict, list, tuple)):
+        within = schema.values() if isinstance(schema, dict) else schema
+        return [part for one in within for part in shared_parts(one)]
+    if isinstance(schema, (schemas.vol.All, schemas.vol.Any)):
+        return [schema, *shared_parts(schema.validators)]
+    return []
 
 
 def number(text: str) -> float | None:

@@ -59,13 +59,17 @@ pub struct Announcement {
 pub(super) type Components = Vec<(String, Map<String, Value>)>;
 
 impl Announcement {
+    /// What Home Assistant takes for granted of an availability and of a device (`connections`) is said all the same: while
+    /// one of its threads loads a platform, others may pass over what gives these parts their defaults, and an entity
+    /// that comes in that moment is refused for want of them.
     pub(super) fn new(
         gateway: &Gateway,
         identity: &str,
-        device: Value,
+        mut device: Value,
         availability: &[String],
         mut components: Components,
     ) -> Announcement {
+        device["connections"] = json!([]);
         for (_, component) in &mut components {
             release::fit(component, gateway.release);
         }
@@ -73,8 +77,8 @@ impl Announcement {
         head.insert("device".into(), device);
         head.insert("origin".into(), gateway.origin());
         if !availability.is_empty() {
-            let topics: Vec<Value> = availability.iter().map(|topic| json!({"topic": topic})).collect();
-            head.insert("availability".into(), topics.into());
+            let entries: Vec<Value> = availability.iter().map(|topic| availability_on(topic)).collect();
+            head.insert("availability".into(), entries.into());
             head.insert("availability_mode".into(), "all".into());
         }
         // No `qos`: with 1, Home Assistant keeps a command that is given while the broker is away, and
@@ -181,6 +185,13 @@ impl Announcement {
         Message::retained(self.topic.clone(), self.payload_with(&[]))
     }
 
+    /// Takes away all that it announces, and leaves the device. Not retained, since it is said beside what is announced.
+    pub fn tombstones(&self) -> Message {
+        let nothing = Announcement { components: Vec::new(), ..self.clone() };
+        let gone: Vec<(&str, &str)> = self.components().collect();
+        Message::once(self.topic.clone(), nothing.payload_with(&gone))
+    }
+
     /// With tombstones for `gone` components beside those that are there.
     fn payload_with(&self, gone: &[(&str, &str)]) -> String {
         let mut components: Map<String, Value> = self
@@ -212,6 +223,10 @@ pub fn announcer(payload: &str) -> Option<String> {
     let components = announced["components"].as_object().into_iter().flatten();
     let mut named = available_by.chain(components.map(|(_, component)| &component["state_topic"]));
     named.find_map(|topic| Topics::base_of_state(topic.as_str()?)).map(str::to_string)
+}
+
+fn availability_on(topic: &str) -> Value {
+    json!({"topic": topic, "payload_available": "online", "payload_not_available": "offline"})
 }
 
 fn platform(component: &Map<String, Value>) -> &str {

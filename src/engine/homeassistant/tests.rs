@@ -71,9 +71,13 @@ fn an_announcement_is_one_retained_message_with_everything_home_assistant_needs(
             "manufacturer": "Test",
             "model": "T1",
             "via_device": "busker_bus_cellar",
+            "connections": [],
         },
         "origin": {"name": "busker", "sw_version": env!("CARGO_PKG_VERSION")},
-        "availability": [{"topic": "busker/bridge/state"}, {"topic": "busker/heating/availability"}],
+        "availability": [
+            {"topic": "busker/bridge/state", "payload_available": "online", "payload_not_available": "offline"},
+            {"topic": "busker/heating/availability", "payload_available": "online", "payload_not_available": "offline"},
+        ],
         "availability_mode": "all",
         "components": {
             "relay": {

@@ -128,7 +128,7 @@ def points_go_unseen(house: House) -> None:
         gateway.start()
         came = f"{VALVE}_short_{number}"
         deadline = Deadline("Home Assistant has a point that stays a moment")
-        while came not in home.ask("entities"):
+        while came not in (home.settled_entities() or {}):
             deadline.pass_by()
         end()
         broker.stop(True)

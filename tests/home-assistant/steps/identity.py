@@ -128,7 +128,7 @@ def nothing_is_announced(house: House) -> None:
         house.gateway.wishes = without
         begin_again(house, quietly)
         deadline = Deadline("Home Assistant lets go of everything")
-        while house.home.ask("entities") or house.home.ask("devices") or house.broker.retained_below("homeassistant/#"):
+        while house.home.settled_entities() != {} or house.home.ask("devices") or house.broker.retained_below("homeassistant/#"):
             deadline.pass_by()
         house.log_is_empty()
         house.gateway.wishes = usual

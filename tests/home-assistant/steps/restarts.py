@@ -41,6 +41,24 @@ def restarts(house: House) -> None:
     )
 
 
+def a_platform_is_loaded(house: House) -> None:
+    """All is announced while Home Assistant loads one more platform, and forgets for a moment what goes without saying."""
+    before = set(house.settle())
+    parts = house.home.ask("load", begins=True)
+    with house.broker.listening(["homeassistant/status"]) as ears:
+        house.home.ask("set_up_anew")
+        ears.wait_for(lambda _, payload: payload == "online", "that Home Assistant is there again")
+    same(set(house.settle()), before, "the entities")
+    house.log_is_empty()
+    house.home.ask("load", begins=False)
+    if parts:
+        house.report.row(
+            "all is announced while a thread of Home Assistant compiles anew what the schemas of its platforms share, "
+            f"{parts} parts, as it does when it loads one more platform",
+            f"the {len(before)} entities with their states; the log is empty",
+        )
+
+
 def the_broker_returns_alone(house: House) -> None:
     """Broker and gateway end in the same moment, and only the broker comes back, with all that it kept."""
     usual, house.gateway.wishes = house.gateway.wishes, house.gateway.wishes | {
