@@ -36,6 +36,8 @@ pub struct StateFiles {
     recordings: Option<PathBuf>,
     /// `None` if nothing is kept.
     kept: Option<Kept>,
+    announced: Told<BTreeMap<String, Vec<String>>>,
+    trees: Told<Vec<Tree>>,
     /// Held as long as this lives.
     _lock: Option<File>,
 }
@@ -48,8 +50,6 @@ struct Kept {
     damaged: Mutex<BTreeSet<String>>,
     /// Devices of which it has been said that nothing is remembered.
     unknown: Mutex<BTreeSet<String>>,
-    announced: Told<BTreeMap<String, Vec<String>>>,
-    trees: Told<Vec<Tree>>,
 }
 
 /// What the broker has been told, in a file.
@@ -65,7 +65,15 @@ impl StateFiles {
     /// Keeps nothing, and remembers nothing.
     pub fn nowhere() -> StateFiles {
         let memories = Memories { unkept: Some("nothing is kept".into()), ..Memories::default() };
-        StateFiles { memories: Mutex::new(memories), recordings: None, kept: None, _lock: None }
+        let (announced, trees) = (Told::nothing(ANNOUNCED), Told::nothing(TOPICS));
+        StateFiles {
+            memories: Mutex::new(memories),
+            recordings: None,
+            kept: None,
+            announced,
+            trees,
+            _lock: None,
+        }
     }
 
     /// Reads what is remembered of these devices in `state_dir`. What is wrong with the files goes to
@@ -105,11 +113,10 @@ impl StateFiles {
                 folder,
                 damaged: Mutex::default(),
                 unknown: Mutex::new(unknown.into_iter().map(String::from).collect()),
-                announced: Told::recall(state_dir, ANNOUNCED),
-                trees: Told::recall(state_dir, TOPICS),
             }),
         };
-        Ok(StateFiles { memories: Mutex::new(memories), recordings, kept, _lock })
+        let (announced, trees) = (Told::recall(state_dir, ANNOUNCED), Told::recall(state_dir, TOPICS));
+        Ok(StateFiles { memories: Mutex::new(memories), recordings, kept, announced, trees, _lock })
     }
 
     /// Where recordings of what was on the wire are kept, if they are.
@@ -170,25 +177,25 @@ impl StateFiles {
 
     /// What Home Assistant may have of earlier runs, by topic; only once.
     pub fn take_announced(&self) -> BTreeMap<String, Vec<String>> {
-        self.kept.as_ref().map_or_else(BTreeMap::new, |kept| kept.announced.take())
+        self.announced.take()
     }
 
     /// Keeps what Home Assistant may have, if it is not what is kept. Does not wait for that.
     pub fn store_announced(&self, told: &BTreeMap<&str, Vec<Cow<'_, str>>>) {
         if let Some(kept) = &self.kept {
-            kept.announced.store(told, &kept.writer);
+            self.announced.store(told, &kept.writer);
         }
     }
 
     /// Where earlier runs have told something, the last one first; only once.
     pub fn take_trees(&self) -> Vec<Tree> {
-        self.kept.as_ref().map_or_else(Vec::new, |kept| kept.trees.take())
+        self.trees.take()
     }
 
     /// Keeps where something is told, or has to be taken back, if it is not what is kept. Does not wait for that.
     pub fn store_trees(&self, trees: &[Tree]) {
         if let Some(kept) = &self.kept {
-            kept.trees.store(trees, &kept.writer);
+            self.trees.store(trees, &kept.writer);
         }
     }
 
@@ -205,7 +212,9 @@ impl<T: Default + DeserializeOwned + Hash> Told<T> {
     fn recall(state_dir: &Path, file: &'static str) -> Told<T> {
         let path = state_dir.join(file);
         let read = match fs::read_to_string(&path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(T::default()),
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+                Ok(T::default())
+            }
             Err(error) => Err(error.to_string()),
             Ok(text) => serde_json::from_str(&text).map_err(|error| error.to_string()),
         };
@@ -213,6 +222,14 @@ impl<T: Default + DeserializeOwned + Hash> Told<T> {
             tracing::warn!("`{}` cannot be used ({reason}) and will be written anew", path.display());
             T::default()
         });
+        Told::with(file, recalled)
+    }
+
+    fn nothing(file: &'static str) -> Told<T> {
+        Told::with(file, T::default())
+    }
+
+    fn with(file: &'static str, recalled: T) -> Told<T> {
         Told { file, stored: Mutex::new(fingerprint(&recalled)), recalled: Mutex::new(recalled) }
     }
 
@@ -286,14 +303,12 @@ fn keep_aside(path: &Path) -> io::Result<PathBuf> {
     Err(io::Error::other("there are 99 damaged ones already"))
 }
 
-/// Whether files can be made in `folder`, which is made if it is not there, and filled: on a full disk only empty ones
-/// can be made.
+/// Whether files can be made in `folder`, which is made if it is not there. That a disk is full may pass.
 fn probe(folder: &Path) -> io::Result<()> {
     fs::create_dir_all(folder)?;
     let path = folder.join(".probe");
-    let written = fs::write(&path, [b'\n'; 4096]);
-    let removed = fs::remove_file(&path);
-    written.and(removed)
+    File::create(&path)?;
+    fs::remove_file(&path)
 }
 
 #[cfg(test)]
@@ -432,6 +447,18 @@ mod tests {
         let files = StateFiles::open(&in_the_way, ["one"].into_iter()).expect("no thread is needed");
         let reason = files.memories().unkept.clone().expect("a reason");
         assert!(reason.contains("cannot be written"), "{reason}");
+        // A device may begin anew before the end.
         files.store(Record { device: "one".into(), memory: memory(1) });
+        assert_eq!(files.learn(["one"].into_iter()).devices["one"], memory(1));
+    }
+
+    #[test]
+    fn what_was_announced_is_known_also_where_nothing_more_can_be_written() {
+        let folder = tempfile::tempdir().expect("a folder");
+        fs::write(folder.path().join("devices"), "").expect("a file in the way");
+        fs::write(folder.path().join(ANNOUNCED), r#"{"a/config":["{}"]}"#).expect("a file");
+        let files = StateFiles::open(folder.path(), ["one"].into_iter()).expect("no thread is needed");
+        assert!(files.memories().unkept.is_some());
+        assert_eq!(files.take_announced().into_keys().collect::<Vec<_>>(), ["a/config"]);
     }
 }
