@@ -45,7 +45,7 @@ pub struct App {
 
 /// What the settings name and does not stand in them. It may change while they do not.
 pub(super) struct Keys {
-    password: Option<String>,
+    pub(super) password: Option<String>,
     pub(super) token: Option<String>,
 }
 
@@ -55,11 +55,6 @@ impl Keys {
             password: files::read_secret("password", &settings.mqtt.password)?,
             token: files::read_token(&settings.http.token)?,
         })
-    }
-
-    /// What of them is another than before.
-    pub(super) fn differ_from(&self, before: &Keys) -> reload::Secrets {
-        reload::Secrets { password: self.password != before.password, token: self.token != before.token }
     }
 }
 

@@ -19,7 +19,7 @@ use crate::engine::bus::{self, Bus, Event};
 use crate::engine::homeassistant;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
-use crate::engine::reload::{self, Change, Telling};
+use crate::engine::reload::{self, Change, Circumstances, Telling};
 use crate::engine::settings::Settings;
 use crate::engine::time::Duration;
 
@@ -33,7 +33,7 @@ impl App {
         // What can fail comes before what cannot.
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
         let old = self.plant.settings();
-        let mut change = reload::compare(&old, &settings, keys.differ_from(&self.keys));
+        let mut change = reload::compare(&old, &settings, self.circumstances(&keys));
         let port = self.http_address().map(|address| address.port());
         let listener = match reload::listens_before_leaving(&old, &settings, port) {
             Some(listen) => Some(self.runtime.block_on(Http::bind(listen))?),
@@ -47,8 +47,6 @@ impl App {
             change.remember_elsewhere((&old, &before.memories()), (&settings, &opened.memories()));
             state = Some(opened);
         }
-        // One that could not come back is tried again, whatever has changed.
-        change.http |= self.http.is_none() && settings.http.listen.is_some();
         if change.is_nothing() {
             tracing::info!("the new configuration changes nothing that runs");
         }
@@ -64,6 +62,14 @@ impl App {
         self.reporter.set_configuration_error(None);
         self.plant.stir().stir();
         Ok(())
+    }
+
+    fn circumstances(&self, keys: &Keys) -> Circumstances {
+        Circumstances {
+            password_differs: keys.password != self.keys.password,
+            token_differs: keys.token != self.keys.token,
+            http_is_missing: self.http.is_none(),
+        }
     }
 
     /// The new configuration was no good, and why; everything goes on as it was.
@@ -257,9 +263,8 @@ impl App {
         let (listener, token, failed) = match bound {
             Ok(listener) => (listener, token, None),
             Err(error) => {
-                let host = old.http.listen.as_deref().and_then(|listen| listen.rsplit_once(':'));
-                let before =
-                    host.zip(port).and_then(|((host, _), port)| bind(&format!("{host}:{port}")).ok());
+                let before = reload::listened_before(old, port);
+                let before = before.and_then(|before| bind(&before).ok());
                 (before, self.keys.token.clone(), Some(error))
             }
         };

@@ -30,13 +30,15 @@ pub struct Change {
     pub ended: Vec<String>,
 }
 
-/// Whether what the settings name and do not hold is another now. It may be while they are the same.
+/// What makes a difference beside the settings, also while they are the same.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Secrets {
-    /// The broker's password.
-    pub password: bool,
-    /// The token of HTTP.
-    pub token: bool,
+pub struct Circumstances {
+    /// The broker's password, which stands in a file.
+    pub password_differs: bool,
+    /// The token of HTTP, which does as well.
+    pub token_differs: bool,
+    /// HTTP is not there. Where it could not come back, it is tried again, whatever has changed.
+    pub http_is_missing: bool,
 }
 
 /// How what is known is told from now on.
@@ -159,6 +161,12 @@ pub fn listens_before_leaving<'n>(old: &Settings, new: &'n Settings, port: Optio
     (!is_the_same).then_some(listen)
 }
 
+/// Where HTTP was listened to, to go back there: on the `port` that it had, which may have been for the system to choose.
+pub fn listened_before(old: &Settings, port: Option<u16>) -> Option<String> {
+    let (host, _) = old.http.listen.as_deref()?.rsplit_once(':')?;
+    Some(format!("{host}:{}", port?))
+}
+
 /// Takes back at the broker what the new settings do not have.
 pub fn take_back(outbox: &mut Outbox, old: &Settings, new: &Settings, telling: Telling) {
     let before = match telling {
@@ -172,7 +180,7 @@ pub fn take_back(outbox: &mut Outbox, old: &Settings, new: &Settings, telling: T
 }
 
 /// Compares two configurations.
-pub fn compare(old: &Settings, new: &Settings, changed: Secrets) -> Change {
+pub fn compare(old: &Settings, new: &Settings, beside: Circumstances) -> Change {
     let telling = |settings: &Settings| {
         let mqtt = &settings.mqtt;
         (mqtt.topics.clone(), mqtt.values, mqtt.json, settings.home_assistant.clone())
@@ -195,10 +203,11 @@ pub fn compare(old: &Settings, new: &Settings, changed: Secrets) -> Change {
             }
         }
     };
+    let has_to_come_back = beside.http_is_missing && new.http.listen.is_some();
     let is_gone = |bus: &&Bus| !new.buses.iter().any(|other| other.name == bus.name);
     Change {
-        broker: !old.mqtt.is_reached_as(&new.mqtt) || changed.password,
-        http: old.http != new.http || changed.token,
+        broker: !old.mqtt.is_reached_as(&new.mqtt) || beside.password_differs,
+        http: old.http != new.http || beside.token_differs || has_to_come_back,
         telling,
         memory: old.state_dir != new.state_dir,
         rules: (old.rules() != new.rules()).then(|| new.rules()),
@@ -268,7 +277,7 @@ devices:
             assert!(text.contains(from), "{from}");
             text = text.replace(from, to);
         }
-        let change = compare(&settings(BEFORE), &settings(&text), Secrets::default());
+        let change = compare(&settings(BEFORE), &settings(&text), Circumstances::default());
         let mut words: Vec<String> = Vec::new();
         words.extend(change.broker.then(|| "broker".into()));
         words.extend(change.http.then(|| "http".into()));
@@ -341,12 +350,20 @@ devices:
     }
 
     #[test]
-    fn a_secret_that_is_another_is_a_change_although_the_settings_are_the_same() {
-        for (password, token) in [(false, false), (true, false), (false, true)] {
-            let same = settings(BEFORE);
-            let change = compare(&same, &same, Secrets { password, token });
-            assert_eq!((change.broker, change.http), (password, token));
-            assert_eq!(change.is_nothing(), !password && !token);
+    fn what_makes_a_difference_beside_the_settings_is_a_change_although_they_are_the_same() {
+        let nothing = Circumstances::default();
+        let without = format!("http: {{listen: null}}{BEFORE}");
+        for (text, beside, broker, http) in [
+            (BEFORE, nothing, false, false),
+            (BEFORE, Circumstances { password_differs: true, ..nothing }, true, false),
+            (BEFORE, Circumstances { token_differs: true, ..nothing }, false, true),
+            (BEFORE, Circumstances { http_is_missing: true, ..nothing }, false, true),
+            (&without, Circumstances { http_is_missing: true, ..nothing }, false, false),
+        ] {
+            let same = settings(text);
+            let change = compare(&same, &same, beside);
+            assert_eq!((change.broker, change.http), (broker, http), "{beside:?}");
+            assert_eq!(change.is_nothing(), !broker && !http);
         }
     }
 
@@ -356,7 +373,7 @@ devices:
             .replace("two: {bus: a, unit: 2", "two: {bus: a, unit: 4")
             .replace("'host:503'}", "'host:504'}, c: {tcp: 'host:505'}");
         let (old, new) = (settings(BEFORE), settings(&format!("eeprom: {{daily: 7}}{after}")));
-        let change = compare(&old, &new, Secrets::default());
+        let change = compare(&old, &new, Circumstances::default());
         (old, new, change)
     }
 
@@ -408,7 +425,7 @@ devices:
   one: {bus: a, unit: 9, points: {x: {at: input 0, poll: fast}}}
   four: {bus: a, unit: 4, points: {x: {at: input 0, poll: fast}}}
 ";
-        let change = compare(&settings(BEFORE), &settings(after), Secrets::default());
+        let change = compare(&settings(BEFORE), &settings(after), Circumstances::default());
         let expected = [
             "what holds for every bus has changed, and the buses go on",
             "bus a: two is gone",
@@ -437,5 +454,7 @@ devices:
             let new = with(new);
             assert_eq!(listens_before_leaving(&with(old), &new, port), expected, "{old}, {:?}", new.http);
         }
+        assert_eq!(listened_before(&with("'h:0'"), Some(4711)).as_deref(), Some("h:4711"));
+        assert_eq!(listened_before(&with("null"), None), None);
     }
 }
