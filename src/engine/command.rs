@@ -1,9 +1,9 @@
 //! One command, from the wanted value to exactly one outcome.
 //!
-//! Read first where it matters (EEPROM is written only if it differs; a field of bits needs its
-//! neighbours; some devices act only on another value), write, let it settle, read back, compare. A write without an answer is never repeated: what the
-//! device holds is read, and decides. The state topic is none of this module's business: it shows
-//! only what reads found.
+//! Read first where it matters (EEPROM is written only if it differs; a field of bits needs its neighbours; some devices
+//! act only on another value), write, let it settle, read back, compare. A write without an answer is never repeated:
+//! what the device holds is read, and decides. The state topic is none of this module's business: it shows only what
+//! reads found.
 
 mod wish;
 
@@ -18,7 +18,8 @@ use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
 use crate::engine::time::Duration;
 use crate::engine::transaction::Transaction;
 
-/// A command that has begun.
+/// A command that has begun. Whoever runs it asks the device what it wants asked, and tells it each answer
+/// ([`CommandFlow::answered`]), until a [`Step`] says that it is finished.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CommandFlow {
     point: PointIndex,
@@ -31,8 +32,12 @@ pub struct CommandFlow {
     busy: u32,
 }
 
+/// The exception of a device that does not take the value. Some say so, too, when they take the nearest one.
+const ILLEGAL_VALUE: u8 = 3;
 /// "Accepted, and it will take long": the exception that says nothing is wrong.
 pub const ACKNOWLEDGE: u8 = 5;
+/// The device has done nothing, and wants to be asked again.
+const BUSY: u8 = 6;
 pub const ACCEPTED: &str = "the device has accepted it, and takes its time (exception 5, acknowledge)";
 /// A device that is busy is asked again after this, and so often.
 pub const PAUSE_BUSY: Duration = Duration::from_millis(200);
@@ -52,6 +57,15 @@ enum State {
     Settling { field: Vec<u16>, doubt: Option<Doubt> },
     /// Reads what the device holds now. `doubt` says what was wrong with the write's own answer.
     ReadingBack { field: Vec<u16>, doubt: Option<Doubt> },
+}
+
+/// What a command acts on: a point, how it is written, and what is known of its device ([`codec::resolve`]).
+#[derive(Clone, Copy)]
+struct Subject<'d> {
+    device: &'d Device,
+    point: &'d Point,
+    write: &'d Write,
+    known: &'d [Option<i128>],
 }
 
 /// Why the answer to a write does not settle the matter.
@@ -226,27 +240,27 @@ impl CommandFlow {
         known: &[Option<i128>],
         result: &Result<Answer, RequestError>,
     ) -> Step {
-        let details = &device.points[self.point];
-        let Some(write) = &details.write else {
+        let point = &device.points[self.point];
+        let Some(write) = &point.write else {
             return self.finish(OutcomeKind::Refused, None, Some("read-only".into()));
         };
         if let Some(step) = self.ask_busy_again(write, result) {
             return step;
         }
-        let step = self.next_step(device, details, write, known, result);
+        let step = self.next_step(Subject { device, point, write, known }, result);
         if let Step::Ask(call) = &step {
             self.asked = Some(call.clone());
         }
         step
     }
 
-    /// Exception 6 says that the device has done nothing, and wants to be asked again. (5 says that it is
-    /// doing it: to repeat that would do it twice. What came of it is read back, as often as it takes.)
+    /// A device that is busy has done nothing, and is asked again. (One that has acknowledged is doing it: to repeat that
+    /// would do it twice. What came of it is read back, as often as it takes.)
     fn ask_busy_again(&mut self, write: &Write, result: &Result<Answer, RequestError>) -> Option<Step> {
         let is_reading = matches!(self.asked, Some(Call::Read(_)));
         let is_busy = match result {
             Err(RequestError::Exception(ACKNOWLEDGE)) => is_reading,
-            Err(RequestError::Exception(6)) => true,
+            Err(RequestError::Exception(BUSY)) => true,
             _ => false,
         };
         let most = if is_press(write) { BUSY_MAX_OF_PRESS } else { BUSY_MAX };
@@ -257,16 +271,9 @@ impl CommandFlow {
         Some(Step::AskLater(PAUSE_BUSY, self.asked.clone()?))
     }
 
-    fn next_step(
-        &mut self,
-        device: &Device,
-        details: &Point,
-        write: &Write,
-        known: &[Option<i128>],
-        result: &Result<Answer, RequestError>,
-    ) -> Step {
+    fn next_step(&mut self, subject: Subject<'_>, result: &Result<Answer, RequestError>) -> Step {
         match self.state.clone() {
-            State::ReadingBefore { field } => self.read_before(device, details, write, known, field, result),
+            State::ReadingBefore { field } => self.read_before(subject, field, result),
             State::WritingBetween { field, then } => match result {
                 Ok(_) | Err(RequestError::Exception(ACKNOWLEDGE)) => {
                     self.state = State::Writing { field };
@@ -275,21 +282,17 @@ impl CommandFlow {
                 Err(RequestError::Exception(code)) => self.refused_by_device(*code),
                 Err(error) => self.finish(OutcomeKind::NoReply, None, Some(error.to_string())),
             },
-            State::Writing { field } => self.written(device, details, write, field, result),
+            State::Writing { field } => self.written(subject, field, result),
             // Nothing is asked meanwhile.
-            State::Settling { .. } => Step::Settle(write.settle),
-            State::ReadingBack { field, doubt } => {
-                self.read_back(device, details, write, known, &field, doubt, result)
-            }
+            State::Settling { .. } => Step::Settle(subject.write.settle),
+            State::ReadingBack { field, doubt } => self.read_back(subject, &field, doubt, result),
         }
     }
 
+    /// What is there has been read: it is as wanted already, or is written, with its neighbours as they are.
     fn read_before(
         &mut self,
-        device: &Device,
-        details: &Point,
-        write: &Write,
-        known: &[Option<i128>],
+        Subject { device, point, write, known }: Subject<'_>,
         field: Vec<u16>,
         result: &Result<Answer, RequestError>,
     ) -> Step {
@@ -305,7 +308,7 @@ impl CommandFlow {
             return self.finish(OutcomeKind::NoReply, None, Some("the read before was too short".into()));
         };
         // A button does something by being pressed, whatever its place holds.
-        if details.persistent && !is_press(write) && held == field {
+        if point.persistent && !is_press(write) && held == field {
             let found = tell(device, self.point, known, &held);
             return self.finish(OutcomeKind::Unchanged, found, None);
         }
@@ -336,11 +339,10 @@ impl CommandFlow {
         }
     }
 
+    /// The write has ended: it is settled, or what the device holds now has to decide.
     fn written(
         &mut self,
-        device: &Device,
-        details: &Point,
-        write: &Write,
+        Subject { device, point, write, .. }: Subject<'_>,
         field: Vec<u16>,
         result: &Result<Answer, RequestError>,
     ) -> Step {
@@ -352,7 +354,7 @@ impl CommandFlow {
             }
             Ok(_) => None,
             Err(RequestError::Exception(ACKNOWLEDGE)) => Some(Doubt::Accepted),
-            Err(RequestError::Exception(3)) if device.wire.quirks.clamps_with_exception => {
+            Err(RequestError::Exception(ILLEGAL_VALUE)) if device.wire.quirks.clamps_with_exception => {
                 Some(Doubt::Clamped)
             }
             Err(RequestError::Exception(code)) => return self.refused_by_device(*code),
@@ -365,16 +367,13 @@ impl CommandFlow {
             return Step::Settle(settle);
         }
         self.state = State::ReadingBack { field, doubt };
-        Step::Ask(Call::Read(details.at.span))
+        Step::Ask(Call::Read(point.at.span))
     }
 
-    #[expect(clippy::too_many_arguments, reason = "one step's whole context, used nowhere else")]
+    /// What the device holds now has been read, or cannot be: that is the outcome, unless it is still busy with it.
     fn read_back(
         &mut self,
-        device: &Device,
-        details: &Point,
-        write: &Write,
-        known: &[Option<i128>],
+        Subject { device, point, write, known }: Subject<'_>,
         field: &[u16],
         doubt: Option<Doubt>,
         result: &Result<Answer, RequestError>,
@@ -390,7 +389,7 @@ impl CommandFlow {
                 return self.finish(OutcomeKind::NoReply, None, Some(reason));
             }
         };
-        let Some(held) = codec::words_at(details.at, details.at.span.first(), &words) else {
+        let Some(held) = codec::words_at(point.at, point.at.span.first(), &words) else {
             return self.finish(OutcomeKind::NoReply, None, Some("the read-back was too short".into()));
         };
         let found = tell(device, self.point, known, &held);
@@ -400,7 +399,7 @@ impl CommandFlow {
         }
         if doubt == Some(Doubt::Accepted) && self.busy < BUSY_MAX {
             self.busy += 1;
-            return Step::AskLater(PAUSE_BUSY, Call::Read(details.at.span));
+            return Step::AskLater(PAUSE_BUSY, Call::Read(point.at.span));
         }
         let reason = match doubt {
             Some(Doubt::NoAnswer(error)) => error.to_string(),
