@@ -13,8 +13,8 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
 use crate::engine::health::{
-    BusHealth, Counters, GatewayReport, Percentiles, PeriodReport, Readout, ReadoutValue, SpreadReport,
-    TimingReport,
+    BrokerReport, BusHealth, Counters, GatewayReport, Percentiles, PeriodReport, Readout, ReadoutValue,
+    SpreadReport, TimingReport,
 };
 
 /// What a scraper is told that it gets.
@@ -28,8 +28,21 @@ type Gauges = Family<Labels, OneGauge>;
 pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
     let readings = Readings::taken_from(&mut report);
     let mut registry = Registry::with_prefix("busker");
-    let flag = |on| if on { 1.0 } else { 0.0 };
-    let broker = &report.broker;
+    tell_broker(&mut registry, &report.broker);
+    tell_buses(&mut registry, &report);
+    tell_devices(&mut registry, &report);
+    registry.register_collector(Box::new(readings));
+
+    let mut text = String::new();
+    encode(&mut text, &registry)?;
+    Ok(text)
+}
+
+fn flag(on: bool) -> f64 {
+    if on { 1.0 } else { 0.0 }
+}
+
+fn tell_broker(registry: &mut Registry, broker: &BrokerReport) {
     for (name, help, value) in [
         ("connected", "Whether the broker is connected", flag(broker.connected)),
         (
@@ -62,48 +75,47 @@ pub fn render(mut report: GatewayReport) -> Result<String, fmt::Error> {
         gauge.set(value);
         registry.register(format!("broker_{name}"), help, gauge);
     }
-    counter(&mut registry, "broker_connects", "Connections made", report.broker.connects);
-    counter(&mut registry, "messages_dropped", "Messages that waited too long", report.broker.dropped);
+    counter(registry, "broker_connects", "Connections made", broker.connects);
+    counter(registry, "messages_dropped", "Messages that waited too long", broker.dropped);
+}
 
+fn tell_buses(registry: &mut Registry, report: &GatewayReport) {
     let of_buses = |value: &dyn Fn(&BusHealth) -> f64| {
         report.buses.iter().map(|bus| (vec![("bus", bus.report.name.clone())], value(bus))).collect()
     };
-    gauges(&mut registry, "bus_up", "Whether the link is up", of_buses(&|bus| flag(bus.report.up)));
+    gauges(registry, "bus_up", "Whether the link is up", of_buses(&|bus| flag(bus.report.up)));
     gauges(
-        &mut registry,
+        registry,
         "bus_responding",
         "Whether the bus answers for itself",
         of_buses(&|bus| flag(bus.responding)),
     );
     gauges(
-        &mut registry,
+        registry,
         "bus_load_ratio",
         "Share of the last minute in which the wire was busy",
         of_buses(&|bus| bus.report.load),
     );
     let all_buses = || report.buses.iter().map(|bus| (vec![("bus", bus.report.name.clone())], &bus.report));
-    wire_counters(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.counters)).collect());
-    codes(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.counters)));
-    times(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.timing)));
-    periods(&mut registry, "bus", all_buses().map(|(labels, bus)| (labels, bus.periods())));
+    wire_counters(registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.counters)).collect());
+    codes(registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.counters)));
+    times(registry, "bus", all_buses().map(|(labels, bus)| (labels, &bus.timing)));
+    periods(registry, "bus", all_buses().map(|(labels, bus)| (labels, bus.periods())));
+}
 
+fn tell_devices(registry: &mut Registry, report: &GatewayReport) {
     let labels = |bus: &str, device: &str| vec![("bus", bus.to_string()), ("device", device.to_string())];
     let all_devices = || report.devices().map(|(bus, device)| (labels(&bus.name, &device.name), device));
     let online = all_devices().map(|(labels, device)| (labels, flag(device.online))).collect();
-    gauges(&mut registry, "device_online", "Whether the device answers", online);
+    gauges(registry, "device_online", "Whether the device answers", online);
     let loads = all_devices().map(|(labels, device)| (labels, device.load)).collect();
     let help = "Share of the last minute in which the wire was busy with it";
-    gauges(&mut registry, "device_load_ratio", help, loads);
+    gauges(registry, "device_load_ratio", help, loads);
     let counted = all_devices().map(|(labels, device)| (labels, &device.counters)).collect();
-    wire_counters(&mut registry, "device", counted);
-    codes(&mut registry, "device", all_devices().map(|(labels, device)| (labels, &device.counters)));
-    times(&mut registry, "device", all_devices().map(|(labels, device)| (labels, &device.timing)));
-    periods(&mut registry, "device", all_devices().map(|(labels, device)| (labels, device.periods.clone())));
-    registry.register_collector(Box::new(readings));
-
-    let mut text = String::new();
-    encode(&mut text, &registry)?;
-    Ok(text)
+    wire_counters(registry, "device", counted);
+    codes(registry, "device", all_devices().map(|(labels, device)| (labels, &device.counters)));
+    times(registry, "device", all_devices().map(|(labels, device)| (labels, &device.timing)));
+    periods(registry, "device", all_devices().map(|(labels, device)| (labels, device.periods.clone())));
 }
 
 fn gauges(registry: &mut Registry, name: &str, help: &str, values: Vec<(Labels, f64)>) {
