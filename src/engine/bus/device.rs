@@ -40,6 +40,7 @@ use super::waiting::Target;
 use super::{Context, Severity};
 pub(super) use asking::{Polled, Turn};
 use beats::Beats;
+pub(super) use beats::Need;
 use keeping::Keeping;
 use obeying::Retained;
 use patience::Patience;

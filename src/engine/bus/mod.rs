@@ -1,25 +1,32 @@
-//! One bus as a state machine: what happened goes in, what to do comes out.
+//! One bus as a state machine: what happened goes in ([`Event`]), what to do comes out ([`Action`]).
 //!
-//! [`Bus::handle`] is the page to read first. One request is in flight at a time; when it has ended,
-//! `ask_next` in `turns` chooses the next.
+//! [`Bus::handle`] is the page to read first. One request is in flight at a time, and `in_flight` says what it is for.
+//! When it has ended, `request_ended` gives the answer to whoever wanted it, and `ask_next` in `turns` chooses the next.
 
-mod change;
-mod commands;
-mod context;
-mod device;
+// Who is asked next.
 mod devices;
+mod probing;
+mod turns;
+
+// What people and programs want.
+mod commands;
 mod fetch;
 mod inbox;
+mod requests;
+mod waiting;
+
+// The link, and what is heard on it.
 mod line;
 mod link;
 mod load;
 mod pause;
-mod probing;
 mod recording;
-mod requests;
 mod timekeeping;
-mod turns;
-mod waiting;
+
+// The devices, and what they share.
+mod change;
+mod context;
+mod device;
 
 use std::collections::VecDeque;
 
@@ -58,15 +65,14 @@ use waiting::{Target, WaitingCommands};
 pub enum Event {
     /// The port is open, the connection stands.
     LinkUp,
+    /// The link could not be opened, or is lost, for this reason.
     LinkDown(String),
     /// The request of the last [`Action::Send`] has ended.
     Reply(Reply),
+    /// Somebody wants a point or a thing to be something else.
     Command(Command),
     /// Read this point now, and tell it even if it has not changed.
-    Get {
-        device: String,
-        point: String,
-    },
+    Get { device: String, point: String },
     /// A program asks something.
     Request(request::Request),
     /// The device of this name leaves the bus: [`Bus::has_device`].
@@ -81,7 +87,9 @@ pub enum Event {
     Withdrawn,
     /// The recording of an [`Action::Record`] is in a file, or why not.
     Recorded(Option<request::Request>, Result<Saved, String>),
+    /// The broker is there again. A bus takes it to be there when it begins.
     BrokerUp,
+    /// Nobody hears what is told: see [`OnBrokerLoss`].
     BrokerDown,
     /// The time of [`Bus::wake_at`] has come.
     Wake,
@@ -93,13 +101,10 @@ pub enum Event {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Action {
     /// Ask the line. Exactly one request is in flight: the next `Send` comes after its reply.
-    Send {
-        request: Request,
-        not_before: Time,
-        timeout: Duration,
-    },
+    Send { request: Request, not_before: Time, timeout: Duration },
     /// If the last request is not on the wire yet, take it back and say [`Event::Withdrawn`].
     Withdraw,
+    /// For the broker, in this order.
     Publish(Message),
     /// Keep this for the next start.
     Store(Record),
@@ -111,9 +116,7 @@ pub enum Action {
         keep: usize,
     },
     /// Close the link, if it is open, and open it after this long. The first action of all.
-    Reopen {
-        after: Duration,
-    },
+    Reopen { after: Duration },
     /// A line for the log: said once when something breaks and once when it heals.
     Say(Severity, String),
 }
@@ -144,9 +147,9 @@ pub struct Bus {
     /// A setting has just been written: what is due to be read comes before the next one.
     wrote_setting: bool,
     in_flight: Option<InFlight>,
-    /// Requests in a row that were wanted at once.
+    /// Requests in a row that went before reads that were due, because they were wanted at once.
     ahead: u32,
-    /// Heartbeats and feedings in a row.
+    /// Heartbeats and feedings of watchdogs in a row.
     fed_in_a_row: u32,
     pace: Pace,
     link_state: LinkState,
@@ -186,7 +189,7 @@ enum LinkState {
     },
 }
 
-/// What the request on the wire is for.
+/// The request on the wire, and whom its answer concerns.
 struct InFlight {
     /// `None`: a unit that is no device of this gateway.
     device: Option<usize>,
@@ -349,31 +352,34 @@ impl Bus {
     /// When to call `handle(now, Event::Wake)` if nothing else happens before. While a request is in
     /// flight its reply is what happens next.
     pub fn wake_at(&self) -> Option<Time> {
-        let tell_wholes: &[DeviceState] = if self.context.telling.json { &self.devices } else { &[] };
-        let wholes = tell_wholes.iter().filter_map(DeviceState::whole_due_at);
-        let records = self.record_due_at.into_iter().chain(self.recorder.due_at()).chain(wholes);
+        let whatever_the_line_does = self.due_without_line();
         if self.in_flight.is_some() || self.link_state != LinkState::Up || self.stopping {
-            let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
-            return records.chain(expiring).chain(self.makes_way_at()).min();
+            return whatever_the_line_does.chain(self.makes_way_at()).min();
         }
         if self.now < self.silent_until {
-            let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
-            return records.chain(expiring).chain([self.silent_until]).min();
+            return whatever_the_line_does.chain([self.silent_until]).min();
         }
         let of_devices = self.askable().filter_map(|(_, device)| device.due_at());
         let spared =
             self.waiting.iter().map(|waiting| self.devices[waiting.device].writable_at(waiting.target));
         let settings = self.devices.iter().filter_map(DeviceState::next_setting_at);
         let beats = self.askable().filter_map(|(_, device)| device.beats_at());
-        of_devices
-            .chain(self.waiting.next_deadline())
+        whatever_the_line_does
+            .chain(of_devices)
             .chain(spared.chain(settings).filter(|at| *at > self.now))
             .chain(self.settled_at())
             .chain(self.requests_wake_at())
-            .chain(self.requests_expire_at())
             .chain(beats)
-            .chain(records)
             .min()
+    }
+
+    /// When something is to be stored or told, or has waited for too long.
+    fn due_without_line(&self) -> impl Iterator<Item = Time> {
+        let in_one_message: &[DeviceState] = if self.context.telling.json { &self.devices } else { &[] };
+        let wholes = in_one_message.iter().filter_map(DeviceState::whole_due_at);
+        let records = self.record_due_at.into_iter().chain(self.recorder.due_at());
+        let expiring = self.waiting.next_deadline().into_iter().chain(self.requests_expire_at());
+        records.chain(wholes).chain(expiring)
     }
 
     /// Whether a shutdown has been asked for and nothing is in flight any more.
@@ -387,7 +393,7 @@ impl Bus {
         BusReport { devices, ..self.summary(now) }
     }
 
-    /// With the readings as numbers, for `/metrics`.
+    /// The same for `/metrics`: each device's readings as numbers, and no points.
     pub fn readings(&self, now: Time) -> BusReport {
         let mut report = self.summary(now);
         for (told, device) in report.devices.iter_mut().zip(&self.devices) {
@@ -396,7 +402,7 @@ impl Bus {
         report
     }
 
-    /// The same without points, which are most of it.
+    /// The same without points and readings, which are most of it.
     pub fn summary(&self, now: Time) -> BusReport {
         let reason = match &self.link_state {
             LinkState::Up | LinkState::Renewing => self.line.trouble(now),
@@ -419,6 +425,7 @@ impl Bus {
 
     // What happened to a request.
 
+    /// The request on the wire has ended: counts what is to be learnt about the line, and then sees to the answer.
     fn reply(&mut self, reply: Reply) {
         let Some(in_flight) = self.in_flight.take() else { return };
         self.count_turn(&in_flight);
@@ -448,6 +455,7 @@ impl Bus {
         }
     }
 
+    /// Gives the answer to whoever wanted it.
     fn request_ended(&mut self, in_flight: InFlight, result: Result<Answer, RequestError>) {
         if matches!(in_flight.purpose, Purpose::Scan) {
             return self.scan_answered(in_flight.sent_at, &result);
@@ -483,6 +491,7 @@ impl Bus {
 
     // What somebody wants.
 
+    /// Somebody wants to be told a point or a thing.
     fn get(&mut self, device: &str, name: &str) {
         match self.find(device, name) {
             Some((device, Target::Point(point)))
@@ -496,11 +505,13 @@ impl Bus {
         }
     }
 
+    /// The number of a device, and what of it has this name.
     fn find(&self, device: &str, name: &str) -> Option<(usize, Target)> {
         let index = self.devices.iter().position(|state| state.name() == device)?;
         Some((index, self.devices[index].target_named(name)?))
     }
 
+    /// Lets devices store what is to outlive a restart, when it is time or the bus ends.
     fn remember(&mut self) {
         let is_due = self.record_due_at.is_some_and(|due| self.now >= due);
         if !std::mem::take(&mut self.context.has_to_remember) && !is_due && !self.stopping {

@@ -11,7 +11,7 @@ use crate::engine::modbus::{Call, Request};
 use crate::engine::settings::Link;
 use crate::engine::time::Time;
 
-use super::device::{DeviceState, Polled};
+use super::device::{DeviceState, Need, Polled};
 use super::devices::Next;
 use super::{Action, Bus, GivesWay, InFlight, LinkState, OnBrokerLoss, Purpose};
 
@@ -35,14 +35,14 @@ impl Bus {
                 self.send(device, call, Purpose::BeatWrite(point));
                 continue;
             }
-            if self.begin_overdue_read() || self.nourish(true) {
+            if self.begin_overdue_read() || self.nourish(Need::Late) {
                 continue;
             }
             if self.begin_command() {
                 self.fed_in_a_row = 0;
                 continue;
             }
-            if self.nourish(false) {
+            if self.nourish(Need::Due) {
                 continue;
             }
             // Whoever else wants something has had the chance, and the next feeding may come.
@@ -50,7 +50,7 @@ impl Bus {
             if self.next_fetch() || self.begin_request() || self.begin_setting() || self.next_scan() {
                 continue;
             }
-            if was_held_back && self.nourish(false) {
+            if was_held_back && self.nourish(Need::Due) {
                 // Reads that are due have their turns between feedings: the next setting, or question of a
                 // request, has not to wait for them.
                 self.wrote_setting = false;
@@ -114,40 +114,39 @@ impl Bus {
         true
     }
 
-    /// Heartbeats and watchdogs, those that are due or only those that are `late`; until there were
-    /// [`FED_IN_A_ROW`].
-    fn nourish(&mut self, late: bool) -> bool {
-        let is_begun = self.fed_in_a_row < FED_IN_A_ROW && (self.begin_beat(late) || self.feed(late));
+    /// Serves a heartbeat or a watchdog with that need; until there were [`FED_IN_A_ROW`]. Whether anything was begun.
+    fn nourish(&mut self, need: Need) -> bool {
+        let is_begun = self.fed_in_a_row < FED_IN_A_ROW && (self.begin_beat(need) || self.feed(need));
         self.fed_in_a_row += u32::from(is_begun);
         is_begun
     }
 
-    /// Begins a heartbeat that is due, or `late`: then the device is about to act on its absence.
-    fn begin_beat(&mut self, late: bool) -> bool {
+    /// Begins a heartbeat: what is to be written is read first.
+    fn begin_beat(&mut self, need: Need) -> bool {
         if !self.feeds {
             return false;
         }
         let now = self.now;
-        let due = self.askable().find_map(|(index, device)| Some((index, device.beat_due(now, late)?)));
+        let due = self.askable().find_map(|(index, device)| Some((index, device.beat_due(now, need)?)));
         let Some((device, point)) = due else { return false };
         let call = Call::Read(self.devices[device].details(point).at.span);
         self.send(device, call, Purpose::BeatRead(point));
         true
     }
 
-    /// Asks a device something whose watchdog wants to be fed. If it is `late`, no command goes before.
-    fn feed(&mut self, late: bool) -> bool {
+    /// Asks a device something whose watchdog wants to be fed. If it is late, no command goes before.
+    fn feed(&mut self, need: Need) -> bool {
         if !self.feeds {
             return false;
         }
         let now = self.now;
-        let due = self.askable().find_map(|(index, device)| Some((index, device.feed_due(now, late)?)));
+        let due = self.askable().find_map(|(index, device)| Some((index, device.feed_due(now, need)?)));
         let Some((device, read)) = due else { return false };
         self.line.hurry();
         self.poll(device, self.devices[device].read_call(read));
         if let Some(in_flight) = &mut self.in_flight {
             in_flight.out_of_turn = true;
-            in_flight.gives_way = if late { GivesWay::Nobody } else { GivesWay::Commands };
+            in_flight.gives_way = if need == Need::Late { GivesWay::Nobody } else { GivesWay::Commands };
         }
         true
     }
@@ -191,7 +190,7 @@ impl Bus {
     fn wants_to_feed(&self) -> bool {
         let now = self.now;
         let is_hungry = |device: &DeviceState| {
-            device.beat_due(now, false).is_some() || device.feed_due(now, false).is_some()
+            device.beat_due(now, Need::Due).is_some() || device.feed_due(now, Need::Due).is_some()
         };
         self.feeds && self.askable().any(|(_, device)| is_hungry(device))
     }

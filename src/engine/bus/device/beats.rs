@@ -16,6 +16,25 @@ use super::{Context, DeviceState, Presence, Severity};
 /// So many times within the time that the device allows a heartbeat is due, or a request of any kind.
 const WITHIN: u32 = 3;
 
+/// How long a heartbeat or a watchdog has waited.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::engine::bus) enum Need {
+    /// It is due: a third of the time that the device allows is over, or more.
+    Due,
+    /// Two thirds are over: the device is about to act on the silence.
+    Late,
+}
+
+impl Need {
+    /// The parts of that time that are over then.
+    fn parts(self) -> u32 {
+        match self {
+            Need::Due => 1,
+            Need::Late => 2,
+        }
+    }
+}
+
 /// The registers of one device that want to be written.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Beats {
@@ -48,21 +67,20 @@ impl Beats {
 }
 
 impl DeviceState {
-    /// The heartbeat that is due now; with `late`, only one that has been due for as long again.
-    pub(in crate::engine::bus) fn beat_due(&self, now: Time, late: bool) -> Option<PointIndex> {
+    /// The first heartbeat with that need.
+    pub(in crate::engine::bus) fn beat_due(&self, now: Time, need: Need) -> Option<PointIndex> {
         let due = |beat: &&Beat| {
             let Some(interval) = self.interval_of(beat) else { return false };
             let Some(tried_at) = beat.tried_at else { return true };
-            now >= tried_at + interval * if late { 2 } else { 1 }
+            now >= tried_at + interval * need.parts()
         };
         self.beats.list.iter().find(due).map(|beat| beat.point)
     }
 
-    /// The read that feeds the watchdog, if nothing else has spoken to the device for a part of its time;
-    /// with `late`, for twice that part.
-    pub(in crate::engine::bus) fn feed_due(&self, now: Time, late: bool) -> Option<usize> {
+    /// The read that feeds the watchdog, if nothing has spoken to the device for so long that it has that need.
+    pub(in crate::engine::bus) fn feed_due(&self, now: Time, need: Need) -> Option<usize> {
         let interval = self.feeding_interval()?;
-        let due = now >= self.served_at + interval * if late { 2 } else { 1 };
+        let due = now >= self.served_at + interval * need.parts();
         if due && now >= self.paused_until { self.polls.oldest(now) } else { None }
     }
 
