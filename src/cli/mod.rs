@@ -19,6 +19,7 @@ mod demo;
 mod diagnose;
 mod doctor;
 mod identify;
+mod line;
 pub mod log;
 pub mod output;
 mod plan;
@@ -55,6 +56,7 @@ verbs! {
     demo Demo,
     doctor Doctor,
     identify Identify,
+    line Line,
     plan Plan,
     profiles Profiles,
     read Read,

@@ -3,12 +3,14 @@
 //! Nothing here is serialized. What a profile's author typed is `profile::file`; what is true is here.
 
 mod form;
+mod line;
 mod presentation;
 mod thing;
 mod wire;
 mod write;
 
 pub use form::{Case, Decimals, Encoding, Form, Kind, Names, Order, Unit};
+pub use line::{LineControl, SettingsBy, SettingsRegister};
 pub use presentation::{Category, Platform, Presentation, sentence};
 pub use thing::{PRESS, State, Thing, ThingCommand, ThingKind};
 pub use wire::{Forbidden, Intervals, Limits, Quirks, Wire};
@@ -31,6 +33,8 @@ pub struct Device {
     pub source: String,
     pub identify: Option<Identify>,
     pub wire: Wire,
+    /// `None`: the profile does not say.
+    pub line: Option<LineControl>,
     /// In the profile's order, repetitions one after the other.
     pub points: Vec<Point>,
     /// Made of points; empty for most devices.

@@ -28,6 +28,7 @@ pub mod schedule;
 
 // Understand: who answers, what is known of it, and what changed.
 pub mod identity;
+pub mod line_change;
 pub mod scan;
 pub mod state;
 

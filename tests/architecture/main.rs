@@ -21,7 +21,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
         "configuration",
     ],
     &["modbus", "recorder", "plan", "schedule"],
-    &["identity", "scan", "state"],
+    &["identity", "scan", "line_change", "state"],
     &["topics", "health", "feed", "homeassistant", "outbox", "connection"],
     &["members", "transaction", "command", "memory", "upkeep", "arrivals", "request", "bus", "reload"],
 ];

@@ -7,8 +7,8 @@ use busker::engine::configuration;
 use busker::engine::profile::Library;
 
 /// What a profile says of the device and what a device of the configuration does not say.
-const OF_PROFILES_ONLY: [&str; 6] =
-    ["device:", "manufacturer:", "model:", "source:", "identify:", "left_out:"];
+const OF_PROFILES_ONLY: [&str; 7] =
+    ["device:", "manufacturer:", "model:", "source:", "identify:", "line:", "left_out:"];
 
 #[test]
 fn a_device_of_the_configuration_is_what_a_profile_with_the_same_words_is() {

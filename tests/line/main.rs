@@ -9,6 +9,7 @@ mod pcapng;
 mod peer;
 mod recorder;
 mod scan;
+mod settings;
 #[path = "../support/mod.rs"]
 mod support;
 

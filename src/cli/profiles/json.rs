@@ -5,8 +5,8 @@ use serde_json::{Map, Value as Json, json};
 use super::access;
 use crate::engine::address::Span;
 use crate::engine::device::{
-    Case, Condition, Decimals, Device, Encoding, Form, Identify, Order, Point, PointIndex, Thing, Unit,
-    WriteRule,
+    Case, Condition, Decimals, Device, Encoding, Form, Identify, LineControl, Order, Point, PointIndex,
+    SettingsBy, Thing, Unit, WriteRule,
 };
 use crate::engine::homeassistant::entity;
 use crate::engine::time::Date;
@@ -44,6 +44,7 @@ pub fn device(device: &Device) -> Json {
         },
         "readable": wire.readable.iter().map(|read| span(*read)).collect::<Vec<_>>(),
         "forbidden": forbidden.collect::<Vec<_>>(),
+        "line": device.line.as_ref().map(line),
         "left_out": left_out.collect::<Vec<_>>(),
         "poll": {
             "fast_ms": wire.intervals.fast.as_millis() as u64,
@@ -68,6 +69,21 @@ fn identify(identify: &Identify) -> Json {
             "table": at.table().name(), "address": at.first(), "mask": mask, "equals": equals,
         }),
     }
+}
+
+fn line(line: &LineControl) -> Json {
+    let settings = match &line.settings {
+        SettingsBy::Hand(switches) => json!({"by_hand": switches}),
+        SettingsBy::Register(register) => {
+            let baud: serde_json::Map<String, Json> =
+                register.baud.iter().map(|(baud, code)| (baud.to_string(), (*code).into())).collect();
+            json!({
+                "table": register.at.table().name(), "address": register.at.first(), "add": register.add, "baud": baud,
+                "parity": {"even": register.even, "odd": register.odd, "none": register.none},
+            })
+        }
+    };
+    json!({"settings": settings, "unit_by": line.unit_by})
 }
 
 fn span(span: Span) -> Json {

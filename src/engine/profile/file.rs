@@ -25,6 +25,8 @@ record! {
         identify: Option<Identify>,
         /// How the device behaves on the wire.
         wire: Option<Wire>,
+        /// How the device is told its bit rate, parity and unit.
+        line: Option<LineControl>,
         /// What can be read and written, by name.
         points: Map<Name, Point>,
         /// Things made of several points, by name or, in a repeated group, by path.
@@ -50,6 +52,34 @@ record! {
         equals: Option<u16>,
         /// Only these of its bits count.
         mask: Option<u16>,
+    }
+}
+
+record! {
+    /// How the device is told its bit rate, parity and unit. Either `at`, `baud` and `parity` (a register), or
+    /// `by_hand`.
+    pub struct LineControl {
+        /// The register that takes bit rate and parity, in one word and from its answer on.
+        at: Option<At<Span>>,
+        /// Bits without which the device takes no word there.
+        add: Option<u16>,
+        /// What stands for each bit rate.
+        baud: Map<u32, u16> = Map::default(),
+        /// What stands for each parity.
+        parity: Option<ParityCodes>,
+        /// The switches at the device that set bit rate and parity, in words for people.
+        by_hand: Option<String>,
+        /// The switches at the device that set its unit, in words for people.
+        unit: String,
+    }
+}
+
+record! {
+    /// What stands for each parity.
+    pub struct ParityCodes {
+        even: Option<u16>,
+        odd: Option<u16>,
+        none: Option<u16>,
     }
 }
 

@@ -101,6 +101,7 @@ pub fn load_inline(inline: &Inline<'_>, library: &Library, faults: &mut Faults) 
         source: String::new(),
         identify: None,
         wire,
+        line: None,
         points: read(points, faults)?,
         things,
         left_out: Map::default(),

@@ -3,7 +3,7 @@
 //! A fault here leaves something harmless in the device's place, so that the checks can go on and
 //! all faults are told at once; a device with faults is never handed out.
 
-use crate::engine::address::Span;
+use crate::engine::address::{Span, Table};
 use crate::engine::device::{
     self, Case, Condition, Decimals, Device, Encoding, Kind, Names, Order, Point, PointIndex, Poll,
     Presentation, Quirks, Unit, Write, WriteRule,
@@ -24,6 +24,7 @@ pub fn device(profile: &Profile, points: &[Expanded<'_>], shared: &Shared, fault
     resolution.presentations(&mut resolved, &mut things);
     let wire = resolution.wire();
     let identify = resolution.identify();
+    let line = resolution.line();
     Device {
         profile: profile.device.value.clone(),
         manufacturer: profile.manufacturer.clone(),
@@ -31,6 +32,7 @@ pub fn device(profile: &Profile, points: &[Expanded<'_>], shared: &Shared, fault
         source: profile.source.clone(),
         identify,
         wire,
+        line,
         points: resolved,
         things,
         left_out: profile
@@ -455,6 +457,40 @@ impl Resolution<'_, '_> {
                 None
             }
         }
+    }
+
+    fn line(&mut self) -> Option<device::LineControl> {
+        let line = self.profile.line.as_ref()?;
+        let baud: Vec<(u32, u16)> = line.baud.iter().map(|(baud, code)| (baud.value, *code)).collect();
+        let settings = match (&line.at, &line.parity, &line.by_hand) {
+            (Some(at), Some(parity), None) if !baud.is_empty() => {
+                if at.table() != Table::Holding || at.count() != 1 {
+                    self.faults.add(
+                        &at.place,
+                        "this is no single register that can be written; expected one like `holding 65`",
+                    );
+                }
+                device::SettingsBy::Register(device::SettingsRegister {
+                    at: at.value,
+                    add: line.add.unwrap_or_default(),
+                    baud,
+                    even: parity.even,
+                    odd: parity.odd,
+                    none: parity.none,
+                })
+            }
+            (None, None, Some(switches)) if baud.is_empty() && line.add.is_none() => {
+                device::SettingsBy::Hand(switches.clone())
+            }
+            _ => {
+                self.faults.add(
+                    &line.place,
+                    "not one way to set the line; expected `at`, `baud` and `parity` (and perhaps `add`), or `by_hand`",
+                );
+                return None;
+            }
+        };
+        Some(device::LineControl { settings, unit_by: line.unit.clone() })
     }
 
     fn presentations(&mut self, points: &mut [Point], things: &mut [device::Thing]) {

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::{modes, points, things, words};
 use crate::engine::device::{
-    Category, Device, Encoding, Identify, Platform, Point, PointIndex, Poll, WriteRule,
+    Category, Device, Encoding, Identify, Platform, Point, PointIndex, Poll, SettingsBy, WriteRule,
 };
 use crate::engine::homeassistant::Entity;
 use crate::engine::wanted;
@@ -407,6 +407,16 @@ devices:
             let told =
                 "can carry another function code than the question; busker understands it all the same";
             rows.push(("An error", told.into()));
+        }
+        if let Some(line) = &self.device.line {
+            rows.push(("Its unit is set by", line.unit_by.clone()));
+            rows.push((
+                "Bit rate and parity are set by",
+                match &line.settings {
+                    SettingsBy::Hand(switches) => switches.clone(),
+                    SettingsBy::Register(register) => format!("`busker line`: {}", register.choices()),
+                },
+            ));
         }
         let _ = writeln!(text, "## On the wire\n\n| | |\n|---|---|");
         for (what, value) in rows {
