@@ -1,10 +1,12 @@
 //! `busker run`: the service.
 
+use anyhow::anyhow;
+
 use super::configuration::{ConfigurationArgs, Loaded};
 use super::output::counted;
 use super::{Failure, log};
 use crate::edge::app::App;
-use crate::edge::shutdown::{self, Heard};
+use crate::edge::shutdown::{self, Heard, Signals};
 use crate::edge::state_files::StateFiles;
 use crate::engine::profile::Library;
 use crate::engine::settings::Settings;
@@ -26,12 +28,16 @@ pub struct Args {
 
 pub fn run(args: Args) -> Result<(), Failure> {
     log::start();
+    // Before anything that takes its time: SIGHUP would end the program.
+    let runtime = App::runtime()?;
+    let mut signals = runtime
+        .block_on(async { Signals::listen() })
+        .map_err(|error| anyhow!("signals cannot be heard: {error}"))?;
     let (settings, library) = load(&args).map_err(|failure| failure.so("nothing was started"))?;
     let (buses, devices) = (settings.buses.len(), settings.devices.len());
     let names = settings.devices.iter().map(|device| device.name.as_str());
     let state = StateFiles::open(&settings.state_dir, names)?;
-    let mut app = App::start(settings, library, state)?;
-    let mut signals = app.listen()?;
+    let mut app = App::start_on(runtime, settings, library, state)?;
     if let Some(address) = app.http_address() {
         tracing::info!("HTTP on http://{address}/health");
     }

@@ -62,8 +62,22 @@ impl App {
     /// Starts everything, going on from what is remembered in `state`. By `library` a scan
     /// knows devices. An error means that nothing is left running.
     pub fn start(settings: Settings, library: Library, state: StateFiles) -> anyhow::Result<App> {
+        App::start_on(App::runtime()?, settings, library, state)
+    }
+
+    /// What an app runs on.
+    pub fn runtime() -> anyhow::Result<Runtime> {
+        Runtime::start().context("the runtime cannot be started")
+    }
+
+    /// The same on a runtime on which signals are heard already.
+    pub fn start_on(
+        runtime: Runtime,
+        settings: Settings,
+        library: Library,
+        state: StateFiles,
+    ) -> anyhow::Result<App> {
         let (keys, secrets) = (Keys::read(&settings)?, Secrets::read(&settings.mqtt)?);
-        let runtime = Runtime::start().context("the runtime cannot be started")?;
         let clock = Clock::start();
         let state = Arc::new(Shelf::new(state));
         // What can fail comes before what cannot.
@@ -96,11 +110,6 @@ impl App {
     /// The gateway as it is now. Not from within a runtime.
     pub fn report(&self) -> GatewayReport {
         self.runtime.block_on(self.reporter.report(Detail::Points))
-    }
-
-    /// From now on signals are heard, and do not end the program by themselves.
-    pub fn listen(&self) -> anyhow::Result<Signals> {
-        self.runtime.block_on(async { Signals::listen() }).context("signals cannot be heard")
     }
 
     /// Waits for a signal.

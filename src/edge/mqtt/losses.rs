@@ -1,7 +1,9 @@
 //! Why a connection was not made or is lost, in words for people; and of which kind it is.
 
+use rumqttc::mqttbytes::Error as PacketError;
 use rumqttc::{ConnectReturnCode, ConnectionError, StateError, TlsError};
 
+use super::PACKET_BYTES_MAX;
 use crate::edge::tls;
 use crate::engine::connection::Loss;
 
@@ -10,12 +12,14 @@ pub(super) struct Ends {
     pub address: String,
     pub client_id: String,
     pub base_topic: String,
+    /// Whether it goes through one.
+    pub websocket: bool,
 }
 
 impl Ends {
     /// Somebody else takes this gateway's place again and again.
     pub fn contested(&self) -> String {
-        let Ends { address, client_id, base_topic } = self;
+        let Ends { address, client_id, base_topic, .. } = self;
         format!(
             "the broker at {address} lets this gateway in and closes the connection, again and again: most likely \
              another client has the identifier `{client_id}` too, as a second gateway with `base_topic: {base_topic}` \
@@ -43,6 +47,18 @@ impl Ends {
             ConnectionError::Tls(_) => format!(
                 "no TLS with the broker at {address}: {}; does it speak TLS on this port?",
                 told(error)
+            ),
+            ConnectionError::MqttState(StateError::Deserialization(
+                PacketError::PayloadSizeLimitExceeded(bytes),
+            )) => format!(
+                "the broker at {address} hands on a message of {bytes} bytes, and this gateway takes none that is longer \
+                 than {PACKET_BYTES_MAX}: the connection ends. Somebody has published it on a topic that the gateway \
+                 listens to, a `…/set` perhaps; if it is a retained one it comes again and again, until it is emptied \
+                 (`mosquitto_pub -r -n -t TOPIC`)"
+            ),
+            error if loss(error) == Loss::Closed && !was_made && self.websocket => format!(
+                "the broker at {address} closes the connection before it lets this gateway in; does it listen for \
+                 websockets on this port, and on this path?"
             ),
             error if loss(error) == Loss::Closed && !was_made => format!(
                 "the broker at {address} closes the connection before it lets this gateway in; does it want \
@@ -105,4 +121,32 @@ fn told(error: &ConnectionError) -> String {
         cause = source;
     }
     cause.to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_can_be_mended_is_told_with_its_remedy() {
+        let too_long = || {
+            ConnectionError::MqttState(StateError::Deserialization(PacketError::PayloadSizeLimitExceeded(20)))
+        };
+        let closed = || ConnectionError::MqttState(StateError::ConnectionAborted);
+        for (error, was_made, websocket, remedy) in [
+            (too_long(), true, false, "mosquitto_pub -r -n"),
+            (closed(), false, false, "does it want TLS"),
+            (closed(), false, true, "listen for websockets"),
+            (closed(), true, true, "another client has come"),
+        ] {
+            let ends = Ends {
+                address: "host:1".into(),
+                client_id: "busker_gateway".into(),
+                base_topic: "busker".into(),
+                websocket,
+            };
+            let reason = ends.reason(&error, was_made);
+            assert!(reason.contains("host:1") && reason.contains(remedy), "{reason}");
+        }
+    }
 }

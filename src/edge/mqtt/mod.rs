@@ -105,6 +105,7 @@ impl Broker {
                 address: format!("{}:{}", settings.mqtt.host, settings.mqtt.port),
                 client_id,
                 base_topic: settings.mqtt.base_topic.clone(),
+                websocket: settings.mqtt.websocket.is_some(),
             },
             unreadable: None,
             clock,

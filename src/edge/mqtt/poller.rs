@@ -236,6 +236,7 @@ mod tests {
                 address: "localhost:1883".into(),
                 client_id: "id".into(),
                 base_topic: "busker".into(),
+                websocket: false,
             },
             unreadable: None,
             clock: Clock::start(),

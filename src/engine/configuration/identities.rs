@@ -27,6 +27,13 @@ impl Resolver<'_> {
         }
     }
 
+    /// What a profile says is checked with it; what is wished for the device comes on top.
+    pub(super) fn keys_with_wishes(&mut self, name: &At<Name>, device: &Device) {
+        for (key, owners) in keys::shared(device) {
+            self.faults.add(&name.place, keys::message(&key, &owners));
+        }
+    }
+
     /// What Home Assistant knows an entity by is made of the device's name and the entity's key: `a` with `b_c` is
     /// `a_b` with `c` to it, and of two with one identity it refuses the second.
     pub(super) fn identities(
@@ -36,15 +43,10 @@ impl Resolver<'_> {
         others: &[DeviceSettings],
         file: &Configuration,
     ) {
-        // What a profile says is checked with it; what is wished here may come on top.
-        if device.profile != "inline" {
-            for (key, owners) in keys::shared(device) {
-                self.faults.add(&name.place, keys::message(&key, &owners));
-            }
-        }
         let of_device = |name: &str, device| Known { called: format!("`{name}`"), name: name.into(), device };
         let own = of_device(&name.0, Some(device));
-        for other in others {
+        let is_near = |other: &&DeviceSettings| are_near(&name.0, &other.name);
+        for other in others.iter().filter(is_near) {
             let other = of_device(&other.name, Some(&other.device));
             self.tell_apart(name, &own, &other, "give one of the devices another name");
         }
@@ -64,6 +66,11 @@ impl Resolver<'_> {
         );
         self.faults.add(&name.place, message);
     }
+}
+
+/// Whether one name begins with the other.
+fn are_near(a: &str, b: &str) -> bool {
+    rest_behind(a, b).or(rest_behind(b, a)).is_some()
 }
 
 /// A device or a bus, as Home Assistant knows it.

@@ -293,6 +293,9 @@ impl Resolver<'_> {
                 let settings = read_part(&device.settings);
                 let wanted = settings.map(|settings| wanted::check(settings, &resolved, &mut self.faults));
                 let raw_write = device.raw_write.get().map(|spans| self.raw_write(spans, &resolved));
+                if device.profile.is_some() && device.points.is_some() {
+                    self.keys_with_wishes(name, &resolved);
+                }
                 self.identities(name, &resolved, &devices, file);
                 devices.push(DeviceSettings {
                     name: name.0.clone(),

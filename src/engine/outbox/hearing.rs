@@ -133,7 +133,7 @@ fn of_silence(news: &NotArriving) -> String {
         ),
         None => format!(
             "{found}: most likely its rules do not let this user write there, or not read there. This gateway needs \
-             both (`topic readwrite …` in an `acl_file` of mosquitto)"
+             both (`topic readwrite …` in an `acl_file` of mosquitto), or no command reaches it"
         ),
     }
 }
