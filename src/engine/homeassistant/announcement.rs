@@ -185,6 +185,13 @@ impl Announcement {
         Message::retained(self.topic.clone(), self.payload_with(&[]))
     }
 
+    /// Takes away all that it announces, and leaves the device. Not retained, since it is said beside what is announced.
+    pub fn tombstones(&self) -> Message {
+        let nothing = Announcement { components: Vec::new(), ..self.clone() };
+        let gone: Vec<(&str, &str)> = self.components().collect();
+        Message::once(self.topic.clone(), nothing.payload_with(&gone))
+    }
+
     /// With tombstones for `gone` components beside those that are there.
     fn payload_with(&self, gone: &[(&str, &str)]) -> String {
         let mut components: Map<String, Value> = self

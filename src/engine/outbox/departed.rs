@@ -268,11 +268,17 @@ mod tests {
         let payloads = [announcement(&["flow sensor"]), announcement(&["flow number"])];
         let mut outbox = outbox();
         outbox.recall([(GONE.to_string(), payloads.to_vec())].into(), Vec::new(), &BTreeSet::new());
-        let expected =
-            [format!("{GONE} {}!", payloads[0]), format!("{GONE} {}!", payloads[1]), format!("{GONE} ")];
-        check_sent(&mut outbox, &expected.each_ref().map(String::as_str));
+        let announced = payloads.each_ref().map(|payload| format!("{GONE} {payload}!"));
+        let removal = format!("{GONE} ");
+        // The removal takes away one platform for each key.
+        let tombstones = ["sensor", "number"].map(|platform| {
+            let parts =
+                announcement(&[]).replace("{}", &format!("{{\"flow\":{{\"platform\":\"{platform}\"}}}}"));
+            format!("{GONE} {parts}!")
+        });
+        check_sent(&mut outbox, &[&announced[0], &announced[1], &tombstones[1], &removal]);
         outbox.home_assistant_started(LATER);
-        check_sent(&mut outbox, &[&expected[1], &expected[0], &expected[2]]);
+        check_sent(&mut outbox, &[&announced[1], &announced[0], &tombstones[0], &removal]);
         outbox.settle(LATER + ARRIVES_WITHIN);
         assert_eq!(outbox.ledger().len(), 0);
     }

@@ -89,10 +89,22 @@ impl Outbox {
                 // That is done when it is announced.
                 continue;
             } else {
-                gone.iter().for_each(|gone| self.push_once(Message { retain: false, ..gone.message() }));
+                self.announce_to_remove(&gone);
                 self.queue_last(Queued::Removal(topic.clone()));
             }
             self.departed.is_told(&topic, now);
+        }
+    }
+
+    /// Tells of all parts of what stood on a topic, since Home Assistant lets go only of what it has been told since its
+    /// start. Its removal shall follow, by which Home Assistant takes away one platform for each key: what has been
+    /// several of them is taken away here, all but one.
+    pub(super) fn announce_to_remove(&mut self, parts: &[Announcement]) {
+        for (number, part) in parts.iter().enumerate() {
+            self.push_once(Message { retain: false, ..part.message() });
+            if number > 0 {
+                self.push_once(part.tombstones());
+            }
         }
     }
 

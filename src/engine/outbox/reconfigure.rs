@@ -127,14 +127,12 @@ impl Outbox {
     }
 
     /// What an earlier run has announced, and the broker may have forgotten. What is there no more is announced
-    /// once again and taken away then: Home Assistant lets go only of what it has been told since its start.
+    /// once again and taken away then.
     pub(super) fn recall_announcements(&mut self, topic: &str, payloads: &[String]) {
         if !self.own_devices.contains(topic) {
-            for payload in payloads {
-                if let Some(found) = Announcement::parse(&self.topics, topic, payload) {
-                    self.push_once(Message { retain: false, ..found.message() });
-                }
-            }
+            let parse = |payload: &String| Announcement::parse(&self.topics, topic, payload);
+            let parts: Vec<Announcement> = payloads.iter().filter_map(parse).collect();
+            self.announce_to_remove(&parts);
         }
         // The first is what was announced last.
         payloads.iter().rev().for_each(|payload| self.found(topic, payload));
