@@ -45,6 +45,8 @@ from homeassistant.components.number import const as number_platform
 from homeassistant.components.sensor import const as sensor
 from homeassistant.const import EVENT_STATE_CHANGED, __version__
 from homeassistant.helpers import device_registry, entity_registry, issue_registry
+# Behind Home Assistant, which may have put something else in its place.
+import voluptuous as vol
 
 CORE = {
     "name": "busker's test", "latitude": 48, "longitude": 8, "elevation": 0, "unit_system": "metric",
@@ -195,7 +197,7 @@ class Probe:
         for part, checks in self.checks:
             part._compiled = checks
         self.checks = []
-        if command["begins"] and schemas.vol.__name__ == "voluptuous":
+        if command["begins"] and vol.__name__ == "voluptuous":
             self.checks = [(part, part._compiled) for part in shared_parts(schemas.MQTT_ENTITY_COMMON_SCHEMA.schema)]
             for part, _ in self.checks:
                 part._compiled = []
@@ -240,12 +242,12 @@ class Probe:
 
 def shared_parts(schema) -> list:
     """The parts of a schema that are made of others, such as `vol.All`."""
-    if isinstance(schema, schemas.vol.Schema):
+    if isinstance(schema, vol.Schema):
         return shared_parts(schema.schema)
     if isinstance(schema, (dict, list, tuple)):
         within = schema.values() if isinstance(schema, dict) else schema
         return [part for one in within for part in shared_parts(one)]
-    if isinstance(schema, (schemas.vol.All, schemas.vol.Any)):
+    if isinstance(schema, (vol.All, vol.Any)):
         return [schema, *shared_parts(schema.validators)]
     return []
 
