@@ -5,6 +5,7 @@ mod feeding;
 mod forecast;
 mod network;
 mod plans;
+mod random;
 mod wire;
 
 use std::process::Command;

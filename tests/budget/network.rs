@@ -47,7 +47,8 @@ impl Case {
                 )
             })
             .collect();
-        let mut text = String::from("buses: {net: {tcp: \"10.0.0.1:502\"}}\ndevices:\n");
+        let mut text =
+            String::from("buses: {net: {tcp: \"10.0.0.1:502\", response_timeout: 2s}}\ndevices:\n");
         for unit in 1..=self.devices {
             text += &format!(
                 "  unit_{unit}: {{bus: net, unit: {unit}, poll: {{{}}}, points: {{{}}}}}\n",

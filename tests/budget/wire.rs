@@ -1,5 +1,5 @@
-//! A bus, its guard and a wire that charges what a line charges, on simulated time: ten units that hold
-//! zeros. The wire's arithmetic is the specification's, and not the program's own.
+//! A bus, its guard and a wire that charges what a line charges, on simulated time: units that hold zeros. The wire's
+//! arithmetic is the specification's, and not the program's own. A network charges the devices' turnaround alone.
 
 use std::collections::BTreeMap;
 
@@ -24,6 +24,9 @@ pub struct Asked {
     /// The count of a read, the value of a write.
     pub argument: u16,
 }
+
+/// What stands before the unit on Modbus TCP: the transaction, the protocol, the length.
+const MBAP: usize = 6;
 
 pub struct Wire {
     pub now: Time,
@@ -145,8 +148,12 @@ impl Wire {
 
     fn send(&mut self) {
         self.to_send = None;
-        let frame = self.guard.frame().to_vec();
-        let word = |at: usize| u16::from_be_bytes([frame[at], frame[at + 1]]);
+        let whole = self.guard.frame().to_vec();
+        let is_line = self.settings.buses[0].link.line().is_some();
+        let frame = if is_line { &whole[..] } else { &whole[MBAP..] };
+        // A question for the name is shorter than any other.
+        let byte = |at: usize| frame.get(at).copied().unwrap_or(0);
+        let word = |at: usize| u16::from_be_bytes([byte(at), byte(at + 1)]);
         let (unit, function) = (frame[0], frame[1]);
         let asked = Asked { at: self.now, unit, function, address: word(2), argument: word(4) };
         self.asked.push(asked);
@@ -181,8 +188,13 @@ impl Wire {
             43 => answer.extend(self.names(unit)),
             _ => answer = vec![unit, function | 0x80, 1],
         }
-        answer.extend(crc(&answer).to_le_bytes());
-        let took = self.characters(frame.len() + answer.len()) + self.turnaround;
+        let mut took = self.turnaround;
+        if is_line {
+            answer.extend(crc(&answer).to_le_bytes());
+            took += self.characters(frame.len() + answer.len());
+        } else {
+            answer.splice(..0, [whole[0], whole[1], 0, 0, 0, answer.len() as u8]);
+        }
         self.answer = Some((self.now + took, answer));
     }
 

@@ -46,7 +46,7 @@ fn a_good_configuration_is_summed_up_for_programs() {
     let fast = &bus["devices"][1]["polls"]["fast"];
     assert_eq!(fast["period"], 0.02);
     let real = fast["real_period"].as_f64().expect("a number");
-    assert!((real - 0.02 * load).abs() < 1e-9, "every period stretches by the load: {real}, {load}");
+    assert!((real / (0.02 * load) - 1.0).abs() < 0.05, "every period stretches by the load: {real}, {load}");
     assert_eq!(json["buses"][1]["devices"][0]["profile"], "inline");
 }
 
@@ -199,5 +199,28 @@ fn watchdogs_and_heartbeats_that_will_not_be_fed_in_time_are_named_with_what_to_
         "dampers: watchdog `watchdog` is as the device has it",
     ] {
         assert!(told.contains(part), "`{part}` is missing in:\n{told}");
+    }
+}
+
+#[test]
+fn a_watchdog_that_would_run_out_is_met_with_either_of_what_is_advised() {
+    let watchdog = |watchdog: &str, timeout: &str| {
+        let configuration = format!(
+            "buses: {{basement: {{serial: /dev/serial/by-id/usb-A, baud: 19200, response_timeout: {timeout}}}}}\n\
+             devices:\n\
+             \x20 relays: {{profile: metz-connect/mr-do4, bus: basement, unit: 18, settings: {{watchdog: {watchdog}}}}}\n\
+             \x20 inputs: {{profile: metz-connect/mr-di4, bus: basement, unit: 19}}\n"
+        );
+        json(&check(&configuration, &["--json"]))["buses"][0]["devices"][0]["feeding"][0].clone()
+    };
+    let faulty = watchdog("1200ms", "500ms");
+    assert_eq!((&faulty["met"], &faulty["met_one_silent"]), (&true.into(), &false.into()), "{faulty}");
+    let advice = faulty["advice"].as_str().expect("an advice");
+    let longer = advice.split_once("set `watchdog` to ").and_then(|(_, rest)| rest.split_once(" or longer"));
+    let (longer, _) = longer.unwrap_or_else(|| panic!("{advice}"));
+    let (_, shorter) = advice.split_once("`response_timeout` of the bus to ").expect("a shorter timeout");
+    for (time, timeout) in [(longer, "500ms"), ("1200ms", shorter)] {
+        let told = watchdog(time, timeout);
+        assert_eq!(told["met_one_silent"], true, "{time} {timeout}: {told}");
     }
 }

@@ -4,9 +4,10 @@
 use std::collections::BTreeMap;
 
 use super::budget::Budget;
+use super::forecast::Forecast;
 use crate::engine::configuration::BAUD_RATES;
 use crate::engine::device::Poll;
-use crate::engine::settings::{Bus, DeviceSettings, Line, Link};
+use crate::engine::settings::{DeviceSettings, Line, Link, Settings};
 use crate::engine::time::Duration;
 
 /// So much of the wire the polls shall take at most: commands and repeats want some as well.
@@ -14,13 +15,16 @@ const COMFORTABLE: f64 = 0.9;
 /// Devices and adapters that are faster are rare.
 const BAUD_MOST: u32 = 115_200;
 
-/// What would make the bus keep its periods; nothing where it does.
-pub fn of_bus(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration, budget: &Budget) -> Vec<String> {
-    if budget.load() <= 1.0 {
-        return Vec::new();
-    }
+/// What would make the bus of this number keep its periods.
+pub fn of_bus(
+    settings: &Settings,
+    index: usize,
+    devices: &[&DeviceSettings],
+    turnaround: Duration,
+    budget: &Budget,
+) -> Vec<String> {
     let mut advice = vec![slower(devices, budget)];
-    advice.extend(faster_line(bus, devices, turnaround));
+    advice.extend(faster_line(settings, index, devices, turnaround));
     advice
 }
 
@@ -72,17 +76,25 @@ fn of_these(devices: &[&DeviceSettings], class: &str, period: Duration) -> Strin
 }
 
 /// The slowest usual rate at which the bus keeps its periods, if there is one.
-fn faster_line(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> Option<String> {
-    let line = bus.link.line()?;
+fn faster_line(
+    settings: &Settings,
+    index: usize,
+    devices: &[&DeviceSettings],
+    turnaround: Duration,
+) -> Option<String> {
+    let line = settings.buses[index].link.line()?;
     let faster = BAUD_RATES.into_iter().filter(|baud| (line.baud + 1..=BAUD_MOST).contains(baud));
     let load_at = |baud: u32| {
-        let mut other = bus.clone();
-        if let Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } = &mut other.link {
+        let mut other = settings.clone();
+        if let Link::Serial { line, .. } | Link::RtuOverTcp { line, .. } = &mut other.buses[index].link {
             *line = Line { baud, ..*line };
         }
-        Budget::of(&other, devices, turnaround).load()
+        let budget = Budget::of(&other.buses[index], devices, turnaround);
+        // What even the polls alone do not leave room for need not be tried.
+        let is_worth_it = budget.load_of_polls() <= COMFORTABLE;
+        is_worth_it.then(|| (baud, Forecast::of(&other, index, devices, turnaround, &budget).load))
     };
-    let (baud, load) = faster.map(|baud| (baud, load_at(baud))).find(|(_, load)| *load <= COMFORTABLE)?;
+    let (baud, load) = faster.filter_map(load_at).find(|(_, load)| *load <= COMFORTABLE)?;
     Some(format!(
         "raise `baud` to {baud} where all devices can: the bus is then busy {:.0} % of the time",
         load * 100.0

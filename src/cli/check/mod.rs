@@ -3,10 +3,13 @@
 mod advice;
 mod budget;
 mod feeding;
-mod round;
+mod forecast;
+mod rehearsal;
 
 use std::collections::BTreeMap;
+use std::num::NonZero;
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::Serialize;
 
@@ -15,11 +18,12 @@ use super::output::{self, Table, counted};
 use super::{Failure, output::print_json};
 use crate::edge::link::adapter;
 use crate::engine;
-use crate::engine::settings::{Bus, DeviceSettings};
+use crate::engine::settings::{DeviceSettings, Settings};
 use crate::engine::time::Duration;
 use crate::engine::yaml::{Diagnostic, Scalar};
 use budget::Budget;
 use feeding::{Delays, Feeding};
+use forecast::Forecast;
 
 /// Check the configuration and the profiles that it uses
 ///
@@ -153,16 +157,12 @@ impl Finding {
 impl Summary {
     fn of(file: String, loaded: &Loaded, turnaround: Duration) -> Summary {
         let settings = &loaded.settings;
-        let on_bus = |index: usize| -> Vec<&DeviceSettings> {
-            settings.devices.iter().filter(|device| device.bus == index).collect()
-        };
-        let buses = settings.buses.iter().enumerate();
         Summary {
             file,
             status: "good",
             turnaround: turnaround.as_secs_f64(),
             warnings: loaded.warnings.iter().map(Finding::of).collect(),
-            buses: buses.map(|(index, bus)| BusSummary::of(bus, &on_bus(index), turnaround)).collect(),
+            buses: BusSummary::all(settings, turnaround),
         }
     }
 
@@ -227,14 +227,39 @@ impl PollSummary {
 }
 
 impl BusSummary {
-    fn of(bus: &Bus, devices: &[&DeviceSettings], turnaround: Duration) -> BusSummary {
+    /// Of all buses, in the order of the configuration. Each takes a while, so all processors work on them.
+    fn all(settings: &Settings, turnaround: Duration) -> Vec<BusSummary> {
+        let next = AtomicUsize::new(0);
+        let work = || {
+            let taken = std::iter::from_fn(|| Some(next.fetch_add(1, Ordering::Relaxed)));
+            let buses = taken.take_while(|index| *index < settings.buses.len());
+            buses.map(|index| (index, BusSummary::of(settings, index, turnaround))).collect()
+        };
+        let threads = std::thread::available_parallelism().map_or(1, NonZero::get).min(settings.buses.len());
+        let mut buses: Vec<(usize, BusSummary)> = std::thread::scope(|scope| {
+            let others: Vec<_> = (1..threads).map(|_| scope.spawn(work)).collect();
+            let mut buses: Vec<_> = work();
+            for other in others {
+                buses.extend(other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+            }
+            buses
+        });
+        buses.sort_by_key(|(index, _)| *index);
+        buses.into_iter().map(|(_, bus)| bus).collect()
+    }
+
+    fn of(settings: &Settings, index: usize, turnaround: Duration) -> BusSummary {
+        let bus = &settings.buses[index];
+        let devices: Vec<&DeviceSettings> =
+            settings.devices.iter().filter(|device| device.bus == index).collect();
+        let devices = devices.as_slice();
         let budget = Budget::of(bus, devices, turnaround);
-        let load = budget.load();
+        let forecast = Forecast::of(settings, index, devices, turnaround, &budget);
+        let load = forecast.load;
         let summary = |(number, settings): (usize, &&DeviceSettings)| {
             let mut polls: BTreeMap<&'static str, PollSummary> = BTreeMap::new();
             for read in budget.reads.iter().filter(|read| read.device == number) {
-                // A bus that cannot keep up stretches every period by the same factor.
-                let real_period = read.period.map(|period| period * budget.stretch_of(read.device));
+                let real_period = read.period.map(|period| forecast.real_period(number, read.poll, period));
                 let empty = PollSummary { reads: 0, seconds: 0.0, period: read.period, real_period };
                 let poll = polls.entry(read.poll.name()).or_insert(empty);
                 poll.reads += 1;
@@ -262,7 +287,11 @@ impl BusSummary {
             load,
             command_wait: budget.longest(),
             command_wait_one_silent: budget.one_silent.max(budget.longest()),
-            advice: advice::of_bus(bus, devices, turnaround, &budget),
+            advice: if load > 1.0 {
+                advice::of_bus(settings, index, devices, turnaround, &budget)
+            } else {
+                Vec::new()
+            },
             devices: devices.iter().enumerate().map(summary).collect(),
         }
     }
