@@ -43,7 +43,7 @@ pub struct App {
     pub(super) watch: JoinHandle<()>,
 }
 
-/// What the settings name and does not stand in them. It may change while they do not.
+/// Secrets that the settings only name, since they stand in files: they may change while the settings do not.
 pub(super) struct Keys {
     pub(super) password: Option<String>,
     pub(super) token: Option<String>,

@@ -4,13 +4,14 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 use crate::edge::bell::Bell;
 use crate::edge::clock::Clock;
-use crate::edge::guarded_link::GuardedLink;
+use crate::edge::guarded_link::{GuardedLink, Woken};
 use crate::edge::link::{Link, Lost};
+use crate::edge::lock::lock;
 use crate::edge::log;
 use crate::edge::recordings;
 use crate::edge::state_files::Shelf;
@@ -177,23 +178,23 @@ impl BusRunner {
         of_port.into_iter().chain(self.bus.wake_at()).min()
     }
 
-    /// Does what there is to do. `letters`: the bell has rung; `bytes`: the link has some.
-    pub(super) fn woken(&mut self, letters: bool, bytes: bool) {
-        if letters {
+    /// Does what there is to do: the bell has rung, the link has bytes, or it is time to go on.
+    pub(super) fn woken(&mut self, woken: Woken) {
+        if woken.bell {
             self.read_letters();
             self.stop_if_asked();
         }
         // The bell rings also for a link that has opened. Where it is only the bus's time that has come, there
         // is nothing to be read.
         let is_links_turn = match &self.port {
-            Port::Open(link) => bytes || link.wake_at().is_some_and(|at| self.clock.now() >= at),
+            Port::Open(link) => woken.link || link.wake_at().is_some_and(|at| self.clock.now() >= at),
             Port::Closed | Port::Waiting(_) | Port::Opening(_) => true,
         };
         if is_links_turn {
             self.advance_port();
         }
         // What came has told the bus the time. (If it was nothing whole, the thread asks again when to go on.)
-        if !bytes && self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
+        if !woken.link && self.bus.wake_at().is_some_and(|at| self.clock.now() >= at) {
             self.handle(Event::Wake);
         }
         self.perform();
@@ -228,8 +229,7 @@ impl BusRunner {
                     }
                 }
                 Action::Publish(message) => {
-                    // Of a device that is there its values are told, and nothing else.
-                    if message.topic.ends_with("/availability") || message.topic.ends_with("/info") {
+                    if message.says_how_a_device_is() {
                         self.stir.stir();
                     }
                     self.outgoing.push(message);
@@ -362,9 +362,4 @@ impl Drop for BusRunner {
     fn drop(&mut self) {
         lock(&self.inbox).close();
     }
-}
-
-fn lock(inbox: &Mutex<Inbox>) -> MutexGuard<'_, Inbox> {
-    // It is whole after every call, whoever panicked meanwhile.
-    inbox.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -32,6 +32,11 @@ impl Message {
     pub fn once(topic: impl Into<String>, payload: impl Into<String>) -> Message {
         Message { topic: topic.into(), payload: payload.into(), retain: false }
     }
+
+    /// Whether it says of a device whether it is there, or what it lacks. Of one that is well only values are told.
+    pub fn says_how_a_device_is(&self) -> bool {
+        self.topic.ends_with("/availability") || self.topic.ends_with("/info")
+    }
 }
 
 /// What somebody else published for us.
