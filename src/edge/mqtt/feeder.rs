@@ -1,4 +1,4 @@
-//! Feeds the client library from the mailbox, which also learns from what comes in.
+//! Feeds the client library from the mailbox, which also hears what comes in.
 
 use std::sync::{Arc, Mutex};
 
@@ -27,7 +27,8 @@ pub(super) enum Order {
     End(Option<Arc<Mailbox>>),
 }
 
-/// Feeds the library from the outbox, and tells it what comes in but for what is for a bus: that has been brought there.
+/// Feeds the client library with what the outbox holds, and lets the outbox hear what comes in. What is for a bus does
+/// not come by here: the poller has brought it there.
 pub(super) struct Feeder<Tell> {
     pub client: AsyncClient,
     pub clock: Clock,
