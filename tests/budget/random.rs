@@ -34,7 +34,7 @@ impl Chance {
 
     /// One as likely between 1 and 10 as between 10 and 100.
     fn log(&mut self, from: f64, to: f64) -> u64 {
-        (from * (to / from).powf(self.below(1000) as f64 / 1000.0)) as u64
+        (from * libm::pow(to / from, self.below(1000) as f64 / 1000.0)) as u64
     }
 }
 
