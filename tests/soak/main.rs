@@ -7,6 +7,7 @@
 mod dead_unit;
 mod device;
 mod losses;
+mod refusals;
 mod world;
 
 use std::collections::BTreeMap;

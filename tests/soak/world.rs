@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use busker::engine::bus::{Action, Bus, Event};
+use busker::engine::health::BusReport;
 use busker::engine::memory::Memories;
 use busker::engine::modbus::guard::Guard;
 use busker::engine::modbus::{Reply, RequestError};
@@ -43,6 +44,8 @@ pub struct World {
     pub disturbance: Option<Disturbance>,
     /// So many requests have been sent since there was one.
     disturbed_requests: u32,
+    /// What was stored for the next start.
+    pub memories: Memories,
 }
 
 /// A disturbance that comes at a fixed period.
@@ -112,6 +115,7 @@ impl World {
             collisions: 0,
             disturbance: None,
             disturbed_requests: 0,
+            memories: Memories::default(),
         }
     }
 
@@ -119,6 +123,10 @@ impl World {
     pub fn tell(&mut self, event: Event) {
         self.bus.handle(self.now, event);
         self.perform();
+    }
+
+    pub fn report(&self) -> BusReport {
+        self.bus.summary(self.now)
     }
 
     /// The adapter is pulled out; the gateway may try to open it again, and can after `away`.
@@ -188,7 +196,8 @@ impl World {
         // The silence is no whole number of microseconds.
         let silent = self.receiver.deadline().map(|at| at + Duration::from_micros(1));
         let times = [port, send.or(self.guard.wake_at()), coming, silent, self.bus.wake_at()];
-        times.into_iter().flatten().min().expect("something is always to come")
+        // Of a bus without devices nothing is ever to come.
+        times.into_iter().flatten().min().unwrap_or(Time(u64::MAX))
     }
 
     /// Does what is due, in the order of the program's own loop.
@@ -365,7 +374,10 @@ impl World {
                 Action::Reopen { after } => {
                     self.close(self.now + after);
                 }
-                Action::Store(_) | Action::Record { .. } | Action::Say(..) => {}
+                Action::Store(record) => {
+                    self.memories.devices.insert(record.device, record.memory);
+                }
+                Action::Record { .. } | Action::Say(..) => {}
             }
         }
     }
