@@ -125,8 +125,24 @@ impl World {
         self.perform();
     }
 
+    /// The gateway ends, and begins again with what it has stored.
+    pub fn restart(&mut self) {
+        self.tell(Event::Shutdown);
+        while !self.bus.is_finished() {
+            self.now = self.next_time().max(self.now);
+            self.step();
+        }
+        self.close(self.now);
+        self.bus = Bus::new(self.now, &self.settings, 0, &self.memories);
+        self.perform();
+    }
+
     pub fn report(&self) -> BusReport {
         self.bus.summary(self.now)
+    }
+
+    pub fn has_device(&self, name: &str) -> bool {
+        self.bus.has_device(name)
     }
 
     /// The adapter is pulled out; the gateway may try to open it again, and can after `away`.
@@ -154,6 +170,13 @@ impl World {
         let from = Time(at.0.saturating_sub(12_000_000));
         let frames = self.frames.iter().filter(|(time, who, _)| *who == unit && (from..=at).contains(time));
         frames.map(|(_, _, frame)| format!("\n{frame}")).collect()
+    }
+
+    /// What was said on the whole line in the twelve seconds before `at`.
+    pub fn all_heard_before(&self, at: Time) -> String {
+        let from = Time(at.0.saturating_sub(24_000_000));
+        let frames = self.frames.iter().filter(|(time, ..)| (from..=at).contains(time));
+        frames.map(|(_, who, frame)| format!("\n{who} {frame}")).collect()
     }
 
     /// All requests so far: when each was sent, and to which unit.
