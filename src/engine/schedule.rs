@@ -34,6 +34,8 @@ struct Planned {
     is_repeated: bool,
     /// How often it has been answered since the device connected, as far as that is counted.
     answers: u8,
+    /// Has been answered as it stands, be it before the device was away.
+    was_given: bool,
     /// Has been answered since the device connected, if only with an exception.
     tried: bool,
     /// Answered with an exception: not asked again before.
@@ -224,6 +226,7 @@ impl Polls {
             wanted_now: true,
             is_repeated: false,
             answers: 0,
+            was_given: false,
             tried: false,
             paused_until: Time::default(),
             is_refused: false,
@@ -379,6 +382,7 @@ impl Polls {
     pub fn know_better(&mut self, index: usize) {
         let planned = &mut self.reads[index];
         planned.answers = (planned.answers + 1).min(ANSWERS_WELL_KNOWN);
+        planned.was_given = true;
     }
 
     /// Whether the read comes so often, and has been answered so often, that nobody need wait for it much
@@ -396,11 +400,12 @@ impl Polls {
 
     /// Nothing came of the read, for the moment. It is the next that is asked, if it `goes_first`; else it is due at
     /// once, but goes before nothing else that is due: a device that dies must not keep the line from all others
-    /// until it counts as dead.
+    /// until it counts as dead. What has not been answered since the device connected is wanted as before: the device is
+    /// not there for anybody until it is, and on a line that is full its period may last for minutes.
     pub fn try_again(&mut self, index: usize, now: Time, goes_first: bool) {
         let planned = &mut self.reads[index];
         planned.answers = planned.answers.min(ANSWERS_WELL_KNOWN - ANSWERS_TO_FORGIVE);
-        if planned.period.is_some() && !goes_first {
+        if planned.period.is_some() && planned.tried && !goes_first {
             (planned.is_repeated, planned.began_at) = (true, Some(now));
         } else {
             planned.wanted_now = true;
@@ -410,6 +415,11 @@ impl Polls {
     /// Whether the read has brought anything since the device connected.
     pub fn has_been_answered(&self, index: usize) -> bool {
         self.reads[index].answers > 0
+    }
+
+    /// Whether the device has ever given the read as it stands.
+    pub fn was_given(&self, index: usize) -> bool {
+        self.reads[index].was_given
     }
 
     /// The read was refused by the device: ask again later than usual.
@@ -499,6 +509,7 @@ impl Polls {
                 planned.wanted_now = before.wanted_now;
                 planned.is_repeated = before.is_repeated;
                 planned.answers = before.answers;
+                planned.was_given = before.was_given;
                 planned.tried = before.tried;
                 planned.paused_until = before.paused_until;
                 planned.is_refused = before.is_refused;

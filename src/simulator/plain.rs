@@ -12,6 +12,7 @@ use crate::engine::address::{Span, Table};
 use crate::engine::codec;
 use crate::engine::device::{Device, Identify, Point, Write, WriteRule};
 use crate::engine::time::Time;
+use crate::engine::value::Reading;
 use crate::simulator::device::{Addressed, SimulatedDevice, Stimulus, check_eeprom_length};
 use crate::simulator::pdu::{
     Exception, Request, bits_reply, exception_reply, identification_reply, words_reply, write_reply,
@@ -80,11 +81,27 @@ impl Plain {
 
     /// The raw fields of all points, as the codec wants them.
     fn known(&self) -> Vec<Option<i128>> {
-        let raw = |point: &Point| match codec::raw(point.plain()?, &self.cells.field(point.at)) {
-            codec::Raw::Integer(raw) => Some(raw),
-            _ => None,
+        let raw = |point: &Point| {
+            let form = point.plain()?;
+            match codec::raw(form, &self.cells.field(point.at)) {
+                codec::Raw::Integer(raw) => Some(codec::meant(form, raw)),
+                _ => None,
+            }
         };
         self.device.points.iter().map(raw).collect()
+    }
+
+    /// What each point holds now, as the gateway would tell it if it read them all at one moment.
+    pub fn texts(&self) -> Vec<String> {
+        let known = self.known();
+        (0..self.device.points.len()).map(|index| self.reading(index, &known).to_string()).collect()
+    }
+
+    fn reading(&self, index: usize, known: &[Option<i128>]) -> Reading {
+        match codec::resolve(&self.device, index, known) {
+            Ok(resolved) => codec::read(&resolved, &self.cells.field(self.device.points[index].at)),
+            Err(missing) => Reading::Missing(missing),
+        }
     }
 
     fn answer(&mut self, addressed: Addressed, pdu: &[u8]) -> Result<Vec<u8>, Exception> {
@@ -293,11 +310,9 @@ impl SimulatedDevice for Plain {
     fn outputs(&self) -> Vec<(String, String)> {
         let known = self.known();
         let shown = self.writable().filter(|(_, write)| !matches!(write.rule, WriteRule::Press { .. }));
-        let text = |index: usize| match codec::resolve(&self.device, index, &known) {
-            Ok(resolved) => {
-                codec::read(&resolved, &self.cells.field(self.device.points[index].at)).to_string()
-            }
-            Err(missing) => missing.to_string(),
+        let text = |index: usize| match self.reading(index, &known) {
+            Reading::Missing(missing) => missing.to_string(),
+            reading => reading.to_string(),
         };
         shown.map(|(index, _)| (self.device.points[index].name.clone(), text(index))).collect()
     }

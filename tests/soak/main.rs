@@ -7,6 +7,9 @@
 mod dead_unit;
 mod device;
 mod losses;
+mod profiles;
+mod refusals;
+mod watched;
 mod world;
 
 use std::collections::BTreeMap;

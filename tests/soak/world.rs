@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use busker::engine::bus::{Action, Bus, Event};
+use busker::engine::health::BusReport;
 use busker::engine::memory::Memories;
 use busker::engine::modbus::guard::Guard;
 use busker::engine::modbus::{Reply, RequestError};
@@ -43,6 +44,8 @@ pub struct World {
     pub disturbance: Option<Disturbance>,
     /// So many requests have been sent since there was one.
     disturbed_requests: u32,
+    /// What was stored for the next start.
+    pub memories: Memories,
 }
 
 /// A disturbance that comes at a fixed period.
@@ -112,6 +115,7 @@ impl World {
             collisions: 0,
             disturbance: None,
             disturbed_requests: 0,
+            memories: Memories::default(),
         }
     }
 
@@ -119,6 +123,26 @@ impl World {
     pub fn tell(&mut self, event: Event) {
         self.bus.handle(self.now, event);
         self.perform();
+    }
+
+    /// The gateway ends, and begins again with what it has stored.
+    pub fn restart(&mut self) {
+        self.tell(Event::Shutdown);
+        while !self.bus.is_finished() {
+            self.now = self.next_time().max(self.now);
+            self.step();
+        }
+        self.close(self.now);
+        self.bus = Bus::new(self.now, &self.settings, 0, &self.memories);
+        self.perform();
+    }
+
+    pub fn report(&self) -> BusReport {
+        self.bus.summary(self.now)
+    }
+
+    pub fn has_device(&self, name: &str) -> bool {
+        self.bus.has_device(name)
     }
 
     /// The adapter is pulled out; the gateway may try to open it again, and can after `away`.
@@ -146,6 +170,13 @@ impl World {
         let from = Time(at.0.saturating_sub(12_000_000));
         let frames = self.frames.iter().filter(|(time, who, _)| *who == unit && (from..=at).contains(time));
         frames.map(|(_, _, frame)| format!("\n{frame}")).collect()
+    }
+
+    /// What was said on the whole line in the twelve seconds before `at`.
+    pub fn all_heard_before(&self, at: Time) -> String {
+        let from = Time(at.0.saturating_sub(24_000_000));
+        let frames = self.frames.iter().filter(|(time, ..)| (from..=at).contains(time));
+        frames.map(|(_, who, frame)| format!("\n{who} {frame}")).collect()
     }
 
     /// All requests so far: when each was sent, and to which unit.
@@ -188,7 +219,8 @@ impl World {
         // The silence is no whole number of microseconds.
         let silent = self.receiver.deadline().map(|at| at + Duration::from_micros(1));
         let times = [port, send.or(self.guard.wake_at()), coming, silent, self.bus.wake_at()];
-        times.into_iter().flatten().min().expect("something is always to come")
+        // Of a bus without devices nothing is ever to come.
+        times.into_iter().flatten().min().unwrap_or(Time(u64::MAX))
     }
 
     /// Does what is due, in the order of the program's own loop.
@@ -365,7 +397,10 @@ impl World {
                 Action::Reopen { after } => {
                     self.close(self.now + after);
                 }
-                Action::Store(_) | Action::Record { .. } | Action::Say(..) => {}
+                Action::Store(record) => {
+                    self.memories.devices.insert(record.device, record.memory);
+                }
+                Action::Record { .. } | Action::Say(..) => {}
             }
         }
     }

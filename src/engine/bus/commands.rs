@@ -323,6 +323,10 @@ impl Bus {
             let words = command::words_of(answer);
             state.read_for_command(self.now, active.flow.point(), &words, &mut self.context);
         }
+        // What it leaves unanswered says as much of it as a poll in vain: else each of many commands would be waited for.
+        if let Err(error) = &result {
+            state.failed_command(self.now, error, &mut self.context);
+        }
         let step = active.flow.answered(state.device(), state.known(), &result);
         self.take_step(active, step);
     }

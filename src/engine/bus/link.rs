@@ -104,6 +104,7 @@ impl Bus {
             }
         }
         self.link_state = LinkState::Down { reason: Some(reason.clone()), attempts: attempts + 1 };
+        self.count_lost();
         if let Some(in_flight) = self.in_flight.take() {
             self.request_ended(in_flight, Err(RequestError::Link(reason.clone())));
         }
@@ -149,12 +150,24 @@ impl Bus {
             self.context.say(Severity::Info, format!("bus {}: {text}", self.name));
         }
         self.renew();
+        self.count_lost();
         let is_poll = |in_flight: &InFlight| matches!(in_flight.purpose, Purpose::Poll { .. });
         if was_closed_behind_answer && self.in_flight.as_ref().is_some_and(is_poll) {
             self.withdrawn();
         }
         if let Some(in_flight) = self.in_flight.take() {
             self.request_ended(in_flight, Err(RequestError::Link(reason)));
+        }
+    }
+
+    /// The link has ended, perhaps under a request. Where that had been sent, it was one.
+    fn count_lost(&mut self) {
+        let Some(in_flight) = self.in_flight.as_ref().filter(|in_flight| self.now > in_flight.sent_at) else {
+            return;
+        };
+        self.counters.requests += 1;
+        if let Some(device) = in_flight.device {
+            self.devices[device].count_lost();
         }
     }
 

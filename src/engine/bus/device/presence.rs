@@ -109,8 +109,34 @@ impl DeviceState {
 
     pub(in crate::engine::bus) fn failed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         self.patience.unanswered();
+        self.be_left_alone(now);
+        self.be_missed(now, error, context);
+    }
+
+    /// What a command has asked has ended so. What is asked next for it, or a poll, may be answered at once.
+    pub(in crate::engine::bus) fn failed_command(
+        &mut self,
+        now: Time,
+        error: &RequestError,
+        context: &mut Context,
+    ) {
+        if matches!(error, RequestError::Exception(_) | RequestError::Impossible(_)) {
+            return;
+        }
+        self.patience.unanswered();
+        if self.patience.is_probing() {
+            self.be_left_alone(now);
+        }
+        self.be_missed(now, error, context);
+    }
+
+    fn be_left_alone(&mut self, now: Time) {
         let demanded = self.settings.device.wire.response_timeout;
         self.paused_until = now + self.patience.pause(now, self.full_timeout, demanded);
+    }
+
+    /// It has failed so often that it counts as offline.
+    fn be_missed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {
             let advice = error.what_to_check().map_or(String::new(), |advice| format!("; {advice}"));
             let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row{advice}");
@@ -132,6 +158,11 @@ impl DeviceState {
                 self.patience.took(now, latency);
             }
         }
+    }
+
+    /// The link has ended under a request to it.
+    pub(in crate::engine::bus) fn count_lost(&mut self) {
+        self.counters.requests += 1;
     }
 
     /// So many of its answers came too late.

@@ -20,6 +20,10 @@ const PAUSE_BUSY: Duration = Duration::from_millis(200);
 /// One that is busy for so long is not done soon.
 const BUSY_LONG: Duration = Duration::from_secs(10);
 pub(super) const PAUSE_BUSY_LONG: Duration = Duration::from_secs(2);
+/// One that was given before and is refused now may be wanted of a device that is still starting, or of a gateway that
+/// has lost it: only what is refused for so long is believed to be refused for good.
+const REFUSED_LONG: Duration = Duration::from_secs(10);
+const PAUSE_REFUSED: Duration = Duration::from_secs(2);
 /// A read without an answer is left alone for so long, then for twice as long, and so on.
 const PAUSE_UNANSWERED: Duration = Duration::from_secs(5);
 const PAUSE_UNANSWERED_LONGEST: Duration = Duration::from_secs(60);
@@ -151,8 +155,15 @@ impl DeviceState {
             self.polls.want_again(index);
             return;
         }
-        self.given(index, context);
         let suspects = if code == 2 { read.refused() } else { Vec::new() };
+        if !suspects.is_empty() && self.polls.was_given(index) {
+            let was_answered = self.polls.has_been_answered(index);
+            let since = self.withheld.read(read.span, read.poll, was_answered, now).since;
+            if now - since < REFUSED_LONG {
+                return self.withhold(now, index, PAUSE_REFUSED, &Missing::Exception(code), context);
+            }
+        }
+        self.given(index, context);
         if !suspects.is_empty() {
             self.refused.extend(suspects);
             self.keeping.has_changed(context);

@@ -1,0 +1,178 @@
+//! What a device refuses for a moment is asked as before when the moment is over, and what it refuses for good is
+//! found out; what it leaves unanswered costs the others little; and what was on the wire is counted, however it ended.
+
+use busker::engine::bus::{Command, Event};
+use busker::engine::configuration;
+use busker::engine::profile::Library;
+use busker::engine::settings::Settings;
+use busker::engine::time::{Duration, Time};
+use busker::simulator::LineSettings;
+use busker::simulator::device::Place;
+use busker::simulator::line::Line;
+use busker::simulator::script::Action;
+
+use crate::device::{BLOCK, BLOCKS, Diary, STORED, Timepiece};
+use crate::world::World;
+
+const SERIAL: &str = "serial: /dev/ttyUSB0";
+const UNIT: u8 = 1;
+const OTHER: u8 = 3;
+/// Two blocks, the coils and the registers of both units, each second.
+const EACH_SECOND: usize = 8;
+
+#[test]
+fn what_is_refused_for_a_moment_is_read_in_one_request_again() {
+    // A gateway that mixes something up, and a device that is there before its registers are.
+    for restarts in [false, true] {
+        let mut world = world(SERIAL, "1s");
+        world.run_until(world.now + Duration::from_secs(20));
+        if restarts {
+            world.act(UNIT, &Action::Power { unit: UNIT, on: false });
+            world.run_until(world.now + Duration::from_secs(20));
+            world.act(UNIT, &Action::Power { unit: UNIT, on: true });
+        }
+        fault(&mut world, "exception=2");
+        world.run_until(world.now + Duration::from_secs(5));
+        world.act(UNIT, &Action::Repair { unit: UNIT });
+        world.run_until(world.now + Duration::from_secs(70));
+        assert_eq!(requests(&mut world, 10), 10 * EACH_SECOND, "restarts: {restarts}");
+        // And nothing of it is remembered.
+        let memory = world.memories.devices.get(&device_name(UNIT));
+        assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{memory:?}");
+    }
+}
+
+#[test]
+fn what_is_refused_for_good_by_a_device_that_gave_it_before_is_found_out_soon() {
+    let mut world = world(SERIAL, "1s");
+    world.run_until(world.now + Duration::from_secs(20));
+    // Its new firmware gives single registers only.
+    fault(&mut world, "exception=2");
+    world.run_until(world.now + Duration::from_secs(20));
+    let memory = &world.memories.devices[&device_name(UNIT)];
+    assert!(!memory.refused.is_empty());
+}
+
+#[test]
+fn commands_to_a_device_that_has_died_are_not_waited_for_one_by_one() {
+    let mut world = world(SERIAL, "1s");
+    world.run_until(world.now + Duration::from_secs(20));
+    world.act(UNIT, &Action::Power { unit: UNIT, on: false });
+    // As a scene does it: all that there is, and once more.
+    let points = || (0..STORED).flat_map(|number| [format!("relay_{number}"), format!("level_{number}")]);
+    let died_at = world.now;
+    for wait in [0, 1500] {
+        world.run_until(world.now + Duration::from_millis(wait));
+        for point in points() {
+            let (device, payload) = (device_name(UNIT), "1".into());
+            world.tell(Event::Command(Command { device, point, payload, retained: false }));
+        }
+    }
+    world.run_until(world.now + Duration::from_secs(20));
+    let requests = world.requests();
+    let to_other = requests.iter().filter(|(at, unit)| *unit == OTHER && *at >= died_at).map(|(at, _)| *at);
+    let times: Vec<Time> = std::iter::once(died_at).chain(to_other).collect();
+    let longest = times.windows(2).map(|pair| pair[1] - pair[0]).max().expect("it is asked");
+    // A write and its read-back; each wait is followed by as long a silence.
+    assert!(longest <= Duration::from_millis(2700), "{longest:?}");
+    let outcomes = world.published.iter().filter(|published| published.message.topic.ends_with("/outcome"));
+    assert_eq!(outcomes.count(), 2 * points().count());
+}
+
+/// On a line that is full a period may last for minutes; who is back waits for none.
+#[test]
+fn a_device_that_returns_to_a_full_line_is_back_soon_although_some_of_its_first_answers_are_lost() {
+    // Whichever of the first answers are lost.
+    for number in 0..6 {
+        // Sixty times as much as the line can carry.
+        let mut world = world(SERIAL, "2ms");
+        world.run_until(world.now + Duration::from_secs(5));
+        world.act(UNIT, &Action::Power { unit: UNIT, on: false });
+        world.run_until(world.now + Duration::from_secs(20));
+        world.act(UNIT, &Action::Power { unit: UNIT, on: true });
+        fault(&mut world, ["silent,every=2", "silent,every=3"][number % 2]);
+        world.run_until(world.now + Duration::from_millis(2000 + 700 * number as u64));
+        world.act(UNIT, &Action::Repair { unit: UNIT });
+        world.run_until(world.now + Duration::from_secs(10));
+        let topic = format!("busker/{}/availability", device_name(UNIT));
+        let last = world.published.iter().rev().find(|published| published.message.topic == topic);
+        assert_eq!(last.expect("it was told").message.payload, "online", "{number}");
+    }
+}
+
+#[test]
+fn a_request_whose_link_ends_under_it_is_counted() {
+    for link in [SERIAL, "tcp: \"10.0.0.9:502\""] {
+        let mut world = world(link, "1s");
+        for number in 0..20 {
+            world.run_until(world.now + Duration::from_millis(5000 + number * 7));
+            // It waits for an answer that does not come.
+            fault(&mut world, "silent");
+            let asked = |world: &World| world.requests().iter().filter(|(_, unit)| *unit == UNIT).count();
+            let before = asked(&world);
+            while asked(&world) == before {
+                world.run_until(world.now + Duration::from_millis(5));
+            }
+            world.run_until(world.now + Duration::from_millis(1));
+            world.unplug(Duration::from_millis(100));
+            world.act(UNIT, &Action::Repair { unit: UNIT });
+        }
+        world.run_until(world.now + Duration::from_secs(5));
+        // The last one may be under way.
+        let (report, seen) = (world.report(), world.requests().len() as u64);
+        let of_devices = report.devices.iter().map(|device| device.counters.requests).sum();
+        for counted in [report.counters.requests, of_devices] {
+            assert!((seen - 1..=seen).contains(&counted), "{link}: {counted} of {seen}");
+        }
+    }
+}
+
+fn fault(world: &mut World, fault: &str) {
+    world.act(UNIT, &Action::Fault(format!("unit={UNIT},{fault}").parse().expect("a fault")));
+}
+
+/// How many requests there are in so many seconds.
+fn requests(world: &mut World, seconds: u64) -> usize {
+    let before = world.requests().len();
+    world.run_until(world.now + Duration::from_secs(seconds));
+    world.requests().len() - before
+}
+
+fn world(link: &str, fast: &str) -> World {
+    let turnaround = Duration::from_millis(5);
+    let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
+    for unit in [UNIT, OTHER] {
+        let at = Place { unit, device: device_name(unit) };
+        line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
+    }
+    World::new(gateway(link, fast), line)
+}
+
+fn device_name(unit: u8) -> String {
+    format!("device_{unit}")
+}
+
+fn gateway(link: &str, fast: &str) -> Settings {
+    let readings = BLOCKS.iter().zip(["fast", "slow"]).flat_map(|(block, poll)| {
+        let reading = move |address| format!("reading_{address}: {{at: input {address}, poll: {poll}}}");
+        (*block..block + BLOCK).map(reading)
+    });
+    let stores = (0..STORED).flat_map(|number| {
+        [
+            format!("relay_{number}: {{at: coil {number}, write: any, poll: slow}}"),
+            format!("level_{number}: {{at: holding {number}, write: 0..65535, poll: slow}}"),
+        ]
+    });
+    let points = readings.chain(stores).collect::<Vec<_>>().join(", ");
+    let mut text = format!("buses: {{line: {{{link}, response_timeout: 400ms}}}}\ndevices:\n");
+    for unit in [UNIT, OTHER] {
+        let name = device_name(unit);
+        text += &format!(
+            "  {name}: {{bus: line, unit: {unit}, poll: {{fast: {fast}, slow: 1s}}, points: {{{points}}}}}\n"
+        );
+    }
+    match configuration::load("refusals.yaml", text.as_bytes(), &Library::shipped()) {
+        Ok((settings, _)) => settings,
+        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
+    }
+}
