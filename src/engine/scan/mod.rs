@@ -197,7 +197,11 @@ impl Scan {
             self.asked = Some(Asked::Interview);
             return Some(self.patiently(unit, call));
         }
-        if let Some((unit, looks)) = self.again.pop_front() {
+        while let Some((unit, looks)) = self.again.pop_front() {
+            // It may have answered meanwhile.
+            if self.is_known(self.line(), unit) {
+                continue;
+            }
             self.asked = Some(Asked::Again(unit, looks));
             let how = self.stages.front().map_or(How::Names, |stage| stage.how);
             return Some(self.patiently(unit, how.call()));
@@ -290,6 +294,10 @@ impl Scan {
                 Err(what) => self.give_up(unit, what.clone()),
             },
             None => {}
+        }
+        // However late it was: it says itself whose it is.
+        if let Some(late) = heard.late {
+            self.look_again(late.unit, 0);
         }
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::*;
 use crate::engine::device::Identify;
-use crate::engine::modbus::{Answer, Discarded, Identification, RequestsOfOthers};
+use crate::engine::modbus::{Answer, Discarded, Identification, LateReply, RequestsOfOthers};
 use crate::engine::settings::Parity;
 use crate::engine::time::Time;
 
@@ -184,6 +184,23 @@ fn a_late_answer_is_asked_for_again_with_all_patience() {
     });
     assert_eq!(run.found(), [7]);
     assert!(run.scan.garbled.is_empty(), "{:?}", run.scan.garbled);
+}
+
+#[test]
+fn an_answer_that_comes_when_many_others_have_been_asked_is_not_forgotten() {
+    let late = LateReply { unit: 2, after: Duration::from_millis(900) };
+    let late = Discarded { late_replies: 1, late: Some(late), ..Discarded::default() };
+    let mut times = 0;
+    let run = run(wanted(vec![EVEN], 1..=20), usize::MAX, &mut |_, unit, call| {
+        times += usize::from(unit == 2);
+        match unit {
+            12 => (Err(RequestError::Timeout), if times == 1 { late } else { Discarded::default() }),
+            2 if times > 1 => clean(named(call)),
+            _ => silence(),
+        }
+    });
+    assert_eq!(run.found(), [2]);
+    assert_eq!(run.names_asked(EVEN, 2), 3, "in its turn, since it was late, and for who it is");
 }
 
 #[test]
