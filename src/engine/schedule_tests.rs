@@ -109,7 +109,9 @@ fn what_was_asked_in_vain_is_due_at_once_but_behind_whatever_else_is_due() {
     let mut behind = Pace { idle_at: None, stretch: 2.0 };
     for at in [0, 100] {
         ahead.begin(0, Time::from_millis(5_000 + at), &mut behind);
+        ahead.end(0);
     }
+    ahead.end(1);
     ahead.begin(1, Time::from_millis(5_100), &mut behind);
     ahead.try_again(1, Time::from_millis(5_100), false);
     assert_eq!(ahead.most_urgent(Time::from_millis(5_199)).map(|(index, _)| index), Some(1));
@@ -117,9 +119,14 @@ fn what_was_asked_in_vain_is_due_at_once_but_behind_whatever_else_is_due() {
         panic!("{:?}", ahead.most_urgent(Time::from_millis(5_201)));
     };
     assert!(urgency < 1.0, "{urgency}");
-    // Unless somebody knows that it has to go first; and what has no period has nothing to be due by.
+    // Unless somebody knows that it has to go first, or the device has not answered it since it connected; and what has
+    // no period has nothing to be due by.
     polls.try_again(1, now, true);
     assert_eq!(polls.most_urgent(now), Some((1, Urgency::Wanted)));
+    let mut new = self::polls(&[Poll::Fast]);
+    new.begin(0, now, &mut Pace::default());
+    new.try_again(0, now, false);
+    assert_eq!(new.most_urgent(now), Some((0, Urgency::Wanted)));
     let mut polls = self::polls(&[Poll::Once]);
     polls.begin(0, now, &mut Pace::default());
     polls.try_again(0, now, false);
