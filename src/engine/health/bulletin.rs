@@ -2,7 +2,7 @@
 //! all the rest each minute.
 
 use super::json::info_json;
-use super::{BrokerReport, GatewayReport, TOLD_EVERY};
+use super::{BrokerReport, DeviceReport, GatewayReport, TOLD_EVERY};
 use crate::engine::settings::Settings;
 use crate::engine::time::{Duration, Time};
 use crate::engine::topics::{Message, Topics};
@@ -22,17 +22,20 @@ pub struct Bulletin {
     told: Option<Standing>,
     /// Where it was told.
     places: Vec<String>,
-    /// Whether each device was online when its own health was told.
-    online: Vec<bool>,
+    /// How each device was when its own health was told.
+    devices: Vec<Presence>,
     info: Message,
 }
+
+/// Whether a device is online, and why it is not.
+type Presence = (bool, Option<String>);
 
 /// What is worth telling at once when it changes.
 #[derive(Debug, PartialEq)]
 struct Standing {
     broker: [bool; 4],
     buses: Vec<[bool; 3]>,
-    devices: Vec<bool>,
+    devices: Vec<Presence>,
     has_configuration_error: bool,
 }
 
@@ -50,7 +53,7 @@ impl Bulletin {
             due: Time::default(),
             told: None,
             places: Vec::new(),
-            online: Vec::new(),
+            devices: Vec::new(),
             info: info(settings),
         }
     }
@@ -81,13 +84,14 @@ impl Bulletin {
         }
         if is_due {
             self.due = now + TOLD_EVERY;
-            self.online.clear();
+            self.devices.clear();
         }
-        // What its health says must not be denied by its availability for a minute.
-        self.online.resize(of_devices.len(), false);
-        for ((topic, bus, device), was_online) in of_devices.into_iter().zip(&mut self.online) {
-            if is_due || *was_online != device.online {
-                *was_online = device.online;
+        // What its health says must not be denied for a minute by its availability, nor by the reason in its info.
+        self.devices.resize(of_devices.len(), Presence::default());
+        for ((topic, bus, device), told) in of_devices.into_iter().zip(&mut self.devices) {
+            let found = presence(device);
+            if is_due || *told != found {
+                *told = found;
                 messages.push(Message::retained(topic, device.health_json(&bus.name).to_string()));
             }
         }
@@ -125,7 +129,7 @@ impl Standing {
         Standing {
             broker: of_broker(&report.broker),
             buses: buses.map(|bus| [bus.report.up, bus.report.paused, bus.responding]).collect(),
-            devices: report.devices().map(|(_, device)| device.online).collect(),
+            devices: report.devices().map(|(_, device)| presence(device)).collect(),
             has_configuration_error: report.configuration_error.is_some(),
         }
     }
@@ -133,6 +137,10 @@ impl Standing {
     fn all_respond(&self) -> bool {
         self.buses.iter().all(|[.., responding]| *responding)
     }
+}
+
+fn presence(device: &DeviceReport) -> Presence {
+    (device.online, device.reason.clone())
 }
 
 fn of_broker(broker: &BrokerReport) -> [bool; 4] {
@@ -188,7 +196,11 @@ mod tests {
         let one_is_lost = ["busker/bridge/health", "busker/d1/health"];
         check(&mut bulletin, 2, &gateway(true, true, true, &[true, false]), &one_is_lost);
         check(&mut bulletin, 3, &gateway(true, true, true, &[true, false]), &[]);
-        check(&mut bulletin, 3, &good, &one_is_lost);
+        let mut another_reason = gateway(true, true, true, &[true, false]);
+        another_reason.buses[0].report.devices[1].reason = Some("another device answers".into());
+        check(&mut bulletin, 3, &another_reason, &one_is_lost);
+        check(&mut bulletin, 4, &another_reason, &[]);
+        check(&mut bulletin, 4, &good, &one_is_lost);
         for changed in [
             gateway(true, true, false, &[true, true]),
             gateway(true, false, true, &[true, true]),
