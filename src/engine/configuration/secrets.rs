@@ -7,14 +7,22 @@ pub fn hidden(text: &str) -> String {
     // How far the key is indented whose value is a secret and stands in the lines behind it.
     let mut goes_on: Option<usize> = None;
     for line in text.split_inclusive('\n') {
-        let indent = line.len() - line.trim_start_matches([' ', '\t']).len();
-        goes_on = goes_on.filter(|of_key| indent > *of_key || line.trim().is_empty());
+        let text = line.trim_start_matches([' ', '\t']);
+        let indent = line.len() - text.len();
+        goes_on = goes_on.filter(|of_key| is_of_value(text.trim_end(), indent, *of_key));
         let from = goes_on.map_or_else(|| secret_in_line(line), |_| Some(indent));
         shown += &hidden_in_line(line, from);
         // The rest of a text in quotes or braces, or what `|` or nothing behind the key announces.
         goes_on = goes_on.or(from.map(|_| indent));
     }
     shown
+}
+
+/// Whether a line that may be of the value of a key in a line before it is not a new key.
+fn is_of_value(text: &str, indent: usize, of_key: usize) -> bool {
+    // The entries of a list may stand below its key itself.
+    let is_entry = indent == of_key && (text == "-" || text.starts_with("- "));
+    indent > of_key || is_entry || text.is_empty() || text.starts_with('#')
 }
 
 /// Where the value of a key that looks like a secret's begins.
@@ -85,6 +93,8 @@ mod tests {
                 "  password:\n    - s3cret\n\n    x: y\n  url: a\n",
                 "  password:\n    * ******\n\n    ** *\n  url: a\n",
             ),
+            ("  password:\n  - s3cret\n  url: a\n", "  password:\n  * ******\n  url: a\n"),
+            ("  password: |\n# x\n    s3cret\nbuses:\n", "  password: *\n* *\n    ******\nbuses:\n"),
             ("  password: 'two\n    words'\nbuses:\n", "  password: ****\n    ******\nbuses:\n"),
             ("serial: /dev/serial/by-id/usb@1\n", "serial: /dev/serial/by-id/usb@1\n"),
         ] {
