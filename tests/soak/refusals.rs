@@ -43,6 +43,24 @@ fn what_is_refused_for_a_moment_is_read_in_one_request_again() {
 }
 
 #[test]
+fn a_device_that_was_busy_for_long_and_then_refuses_something_once_has_not_refused_it_for_long() {
+    for before in ["exception=6", "silent,every=2"] {
+        let mut world = world(SERIAL, "1s");
+        world.run_until(world.now + Duration::from_secs(20));
+        fault(&mut world, before);
+        world.run_until(world.now + Duration::from_secs(15));
+        world.act(UNIT, &Action::Repair { unit: UNIT });
+        fault(&mut world, "exception=2");
+        world.run_until(world.now + Duration::from_secs(3));
+        world.act(UNIT, &Action::Repair { unit: UNIT });
+        world.run_until(world.now + Duration::from_secs(70));
+        assert_eq!(requests(&mut world, 10), 10 * EACH_SECOND, "{before}");
+        let memory = world.memories.devices.get(&device_name(UNIT));
+        assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{before}: {memory:?}");
+    }
+}
+
+#[test]
 fn what_is_refused_for_good_by_a_device_that_gave_it_before_is_found_out_soon() {
     let mut world = world(SERIAL, "1s");
     world.run_until(world.now + Duration::from_secs(20));

@@ -45,6 +45,8 @@ struct WithheldRead {
     span: Span,
     poll: Poll,
     since: Time,
+    /// Since when it has been refused each time, as what the device does not have.
+    refused_since: Option<Time>,
     /// Times in a row without an answer that could be used.
     failures: u32,
     /// Has been answered since the device connected.
@@ -60,7 +62,8 @@ impl Withheld {
     fn read(&mut self, span: Span, poll: Poll, was_answered: bool, now: Time) -> &mut WithheldRead {
         let known = self.reads.iter().position(|read| (read.span, read.poll) == (span, poll));
         let at = known.unwrap_or_else(|| {
-            self.reads.push(WithheldRead { span, poll, since: now, failures: 0, was_answered });
+            let (refused_since, failures) = (None, 0);
+            self.reads.push(WithheldRead { span, poll, since: now, refused_since, failures, was_answered });
             self.reads.len() - 1
         });
         &mut self.reads[at]
@@ -121,6 +124,7 @@ impl DeviceState {
         let read = self.polls.shared_read(index);
         let was_answered = self.polls.has_been_answered(index);
         let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
+        withheld.refused_since = None;
         withheld.failures += 1;
         let (failures, pause) = (withheld.failures, withheld.pause(now));
         let answers_others = self.patience.failures() == 1;
@@ -146,8 +150,9 @@ impl DeviceState {
         let read = self.polls.read(index).clone();
         if matches!(code, 5 | 6) {
             let was_answered = self.polls.has_been_answered(index);
-            let since = self.withheld.read(read.span, read.poll, was_answered, now).since;
-            if now - since >= BUSY_LONG {
+            let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
+            withheld.refused_since = None;
+            if now - withheld.since >= BUSY_LONG {
                 self.withhold(now, index, PAUSE_BUSY_LONG, &Missing::Exception(code), context);
             } else {
                 self.polls.pause(index, now + PAUSE_BUSY);
@@ -158,8 +163,8 @@ impl DeviceState {
         let suspects = if code == 2 { read.refused() } else { Vec::new() };
         if !suspects.is_empty() && self.polls.was_given(index) {
             let was_answered = self.polls.has_been_answered(index);
-            let since = self.withheld.read(read.span, read.poll, was_answered, now).since;
-            if now - since < REFUSED_LONG {
+            let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
+            if now - *withheld.refused_since.get_or_insert(now) < REFUSED_LONG {
                 return self.withhold(now, index, PAUSE_REFUSED, &Missing::Exception(code), context);
             }
         }
