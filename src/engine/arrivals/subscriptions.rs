@@ -1,12 +1,14 @@
 //! What the broker is still to be asked for on one connection, and what it is no longer to send.
 
+use std::collections::VecDeque;
+
 /// The topics (filters, with `+`) that are still to be subscribed to or let go of.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Subscriptions {
     wanted: Vec<String>,
     unwanted: Vec<String>,
-    /// What the broker was asked for last; its answer is about these, in this order.
-    asked_for: Vec<String>,
+    /// What the broker has been asked for, each time, and has not answered yet. Answers come in this order.
+    asked_for: VecDeque<Vec<String>>,
 }
 
 impl Subscriptions {
@@ -32,13 +34,13 @@ impl Subscriptions {
 
     /// The broker has been asked for all that is [`Subscriptions::wanted`].
     pub fn asked(&mut self) {
-        self.asked_for = std::mem::take(&mut self.wanted);
+        self.asked_for.push_back(std::mem::take(&mut self.wanted));
     }
 
-    /// What of that it refuses, where it says of each whether it grants it.
-    pub fn refused(&self, granted: impl IntoIterator<Item = bool>) -> Vec<&str> {
-        let answers = granted.into_iter().zip(&self.asked_for);
-        answers.filter(|(granted, _)| !granted).map(|(_, filter)| filter.as_str()).collect()
+    /// The broker has answered, and said of each whether it grants it; what of that it refuses.
+    pub fn refused(&mut self, granted: impl IntoIterator<Item = bool>) -> Vec<String> {
+        let answers = granted.into_iter().zip(self.asked_for.pop_front().unwrap_or_default());
+        answers.filter(|(granted, _)| !granted).map(|(_, filter)| filter).collect()
     }
 
     /// What is to be let go of next.
@@ -99,8 +101,11 @@ mod tests {
         let mut subscriptions = Subscriptions::new(list("a b c"));
         subscriptions.asked();
         assert!(subscriptions.wanted().is_empty());
-        subscriptions.change(list("a b c"), list("a b c d"));
+        // More is asked for before the answer is there.
+        subscriptions.change(list("a b c"), list("a b c d e"));
+        subscriptions.asked();
         assert_eq!(subscriptions.refused([true, false, false]), ["b", "c"]);
-        assert!(subscriptions.refused([true, true, true]).is_empty());
+        assert_eq!(subscriptions.refused([false, true]), ["d"]);
+        assert!(subscriptions.refused([false]).is_empty());
     }
 }
