@@ -97,8 +97,13 @@ impl Bus {
             }
             return self.tell_outcome(device, target, wish.of(outcome));
         }
-        let waiting = Waiting::new(self.now, device, target, wish, is_press);
-        for (replaced, reason) in self.waiting.push(waiting) {
+        self.let_wait(Waiting::new(self.now, device, target, wish, is_press));
+    }
+
+    /// Lets a command wait for its turn, in the place of an older one for the same.
+    fn let_wait(&mut self, command: Waiting) {
+        let device = command.device;
+        for (replaced, reason) in self.waiting.push(command) {
             let outcome = replaced.wanted.ended(OutcomeKind::Expired, reason);
             self.tell_outcome(replaced.device, replaced.target, outcome);
         }
@@ -433,18 +438,14 @@ impl Bus {
 
     /// Nothing has been written of it, nor may be yet.
     fn let_wait_again(&mut self, active: Active) {
-        let device = active.device;
-        if self.is_overtaken(&active) {
+        let Active { device, target, .. } = active;
+        // Whatever waits for the same is newer, and keeps its place, also where nobody can say yet whether it is good.
+        if self.waiting.iter().any(|waiting| (waiting.device, waiting.target) == (device, target)) {
             let outcome = active.wanted.ended(OutcomeKind::Expired, REPLACED);
             return self.end_command(active, outcome);
         }
-        let from = self.devices[device].writable_at(active.target);
-        let waiting = Waiting::new(from, device, active.target, active.wanted, false);
-        for (replaced, reason) in self.waiting.push(waiting) {
-            let outcome = replaced.wanted.ended(OutcomeKind::Expired, reason);
-            self.tell_outcome(replaced.device, replaced.target, outcome);
-        }
-        self.tell_what_waits(device);
+        let from = self.devices[device].writable_at(target);
+        self.let_wait(Waiting::new(from, device, target, active.wanted, false));
     }
 
     fn end_command(&mut self, active: Active, outcome: Outcome) {
