@@ -1,7 +1,7 @@
 //! Which read of a bus is next: the one that is furthest past its period.
 //!
 //! Urgency is the time since a read last began, divided by its period. On a bus that cannot keep up
-//! every period stretches by the same factor ([`Pace`]), and nothing starves. Reads that are wanted at
+//! every period stretches by about the same factor ([`Pace`]), and nothing starves. Reads that are wanted at
 //! once (after a connect, after a write, on request) come before all of them, selectors first.
 
 use std::sync::Arc;
