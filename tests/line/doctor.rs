@@ -1,15 +1,13 @@
 //! `busker doctor` on lines that are well and lines that are not.
 
-use std::os::fd::OwnedFd;
-use std::path::PathBuf;
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
-use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 use serde_json::Value;
 
 use crate::peer::{Peer, Step, rtu};
 use crate::support::program;
+use crate::typed::terminal;
 
 fn doctor(arguments: &[&str]) -> Output {
     Command::new(program()).arg("doctor").args(arguments).output().expect("the program is built")
@@ -73,7 +71,7 @@ fn what_is_heard_unasked_is_bad() {
     for (said, expected) in
         [(rtu(7, &[3, 0, 0, 0, 2]), "another master"), (vec![0x00, 0xFF, 0x13], "belong to no frame")]
     {
-        let (far, path) = line();
+        let (far, path) = terminal();
         let path = path.display().to_string();
         let mut child = Command::new(program())
             .args(["doctor", "--serial", &path, "--listen", "500ms", "--json"])
@@ -120,13 +118,4 @@ fn what_cannot_be_looked_at_is_told_with_its_reason() {
     let output = doctor(&["--config", &config.display().to_string()]);
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(doctor(&[]).status.code(), Some(2));
-}
-
-/// The far end of a line, and the port's path.
-fn line() -> (OwnedFd, PathBuf) {
-    let far =
-        openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a pseudo-terminal");
-    unlockpt(&far).expect("a pseudo-terminal");
-    let path = ptsname(&far, Vec::new()).expect("its name").into_string().expect("plain letters");
-    (far, path.into())
 }

@@ -3,38 +3,23 @@
 use std::fs;
 use std::process::{Command, Output};
 
-use busker::simulator::{DeviceAt, Model, Options, PtyPort, Simulation};
+use busker::simulator::Model;
 use serde_json::{Value, json};
 
 use crate::peer::{Framing, Peer, Step, exception};
 use crate::support::program;
+use crate::typed::{check, found, path, said, simulated};
 
-/// Simulated devices on a pseudo-terminal.
-fn devices(faults: &[&str]) -> (Simulation, PtyPort) {
-    let devices = [(Model::MrDo4, 18), (Model::Relay8, 19), (Model::Sensor, 20)];
-    let devices = devices.map(|(model, unit)| DeviceAt { model, unit });
-    let faults = faults.iter().map(|fault| fault.parse().expect("a fault")).collect();
-    let simulation = Simulation::new(&devices, Options { faults, ..Options::default() }).expect("devices");
-    let port = simulation.serve_pty(None).expect("a pseudo-terminal");
-    (simulation, port)
-}
+const DEVICES: &[(Model, u8)] = &[(Model::MrDo4, 18), (Model::Relay8, 19), (Model::Sensor, 20)];
 
 fn identify(line: &[&str], rest: &[&str]) -> Output {
     Command::new(program()).arg("identify").args(line).args(rest).output().expect("the program is built")
 }
 
-fn found(output: &Output) -> Value {
-    serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {output:?}"))
-}
-
-fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&[&output.stdout[..], &output.stderr[..]].concat()).into_owned()
-}
-
 #[test]
 fn a_device_is_known_by_its_names_or_by_the_register_that_a_profile_goes_by() {
-    let (_simulation, port) = devices(&[]);
-    let path = port.path().display().to_string();
+    let (_simulation, port) = simulated(None, DEVICES, &[]);
+    let path = path(&port);
     for (unit, names, profiles) in [
         (
             "18",
@@ -64,8 +49,8 @@ fits       metz-connect/mr-do4
 
 #[test]
 fn another_device_than_the_one_of_the_profile_is_a_failure_that_says_who_it_is() {
-    let (_simulation, port) = devices(&["unit=18,wrong-identity"]);
-    let path = port.path().display().to_string();
+    let (_simulation, port) = simulated(None, DEVICES, &["unit=18,wrong-identity"]);
+    let path = path(&port);
     let folder = tempfile::tempdir().expect("a temporary folder");
     let file = folder.path().join("busker.yaml");
     let configuration = format!(
@@ -90,8 +75,7 @@ fn another_device_than_the_one_of_the_profile_is_a_failure_that_says_who_it_is()
         (of_profile("fuehlersysteme/analog-in8"), 1, "holds 0x5000, not 0x4000"),
         (of_profile("fuehlersysteme/relay9"), 2, "did you mean `fuehlersysteme/relay8`?"),
     ] {
-        assert_eq!(output.status.code(), Some(code), "{output:?}");
-        assert!(said(&output).contains(says), "{output:?}");
+        check(&output, code, says);
     }
 }
 
@@ -115,11 +99,9 @@ fn silence_and_a_damaged_answer_are_told_apart() {
     let path = peer.path().display().to_string();
     let ask = || identify(&["--serial", &path], &["--unit", "1", "--timeout", "300ms"]);
     peer.misbehave(|_, _| vec![]);
-    let output = ask();
-    assert_eq!(output.status.code(), Some(1), "{output:?}");
     let says =
         "unit 1 answers nothing that fits: no answer in time; check its power, its wiring and its unit";
-    assert!(said(&output).contains(says), "{output:?}");
+    check(&ask(), 1, says);
     let last = peer.asked().last().map(|asked| asked.function);
     assert_eq!(last, Some(3), "whoever knows nothing else knows a register");
 
@@ -128,13 +110,9 @@ fn silence_and_a_damaged_answer_are_told_apart() {
         good[middle] ^= 0x10;
         vec![Step::Say(good)]
     });
-    let output = ask();
-    assert_eq!(output.status.code(), Some(1), "{output:?}");
-    assert!(said(&output).contains("checksum error; check the wire"), "{output:?}");
+    check(&ask(), 1, "checksum error; check the wire");
 
     // A refusal is an answer.
     peer.misbehave(|asked, _| vec![Step::Say(exception(asked, Framing::Rtu, 1))]);
-    let output = ask();
-    assert_eq!(output.status.code(), Some(0), "{output:?}");
-    assert!(said(&output).contains("no profile that goes by what it says"), "{output:?}");
+    check(&ask(), 0, "no profile that goes by what it says");
 }

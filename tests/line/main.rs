@@ -12,6 +12,7 @@ mod scan;
 mod settings;
 #[path = "../support/mod.rs"]
 mod support;
+mod typed;
 
 use peer::{Asked, Framing, Misbehave, Peer, Step, read_pdu, reply, rtu};
 use serde_json::Value;

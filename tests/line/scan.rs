@@ -1,48 +1,24 @@
 //! `busker scan` as somebody types it, on simulated lines whose bit rate and parity nobody has told it.
 
 use std::fs;
-use std::io::{BufRead, BufReader, Read};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Command, Output};
 
-use busker::simulator::{DeviceAt, Framing, LineSettings, Model, Options, Parity, PtyPort, Simulation};
-use rustix::process::{Pid, Signal, kill_process};
+use busker::simulator::{Framing, Model, Parity};
 use serde_json::Value;
 
 use crate::peer::{self, Peer};
-use crate::support::program;
-
-/// Devices that hear only who speaks with their bit rate and parity.
-fn line(baud: u32, parity: Parity, devices: &[(Model, u8)], faults: &[&str]) -> (Simulation, PtyPort) {
-    let devices: Vec<DeviceAt> =
-        devices.iter().map(|(model, unit)| DeviceAt { model: *model, unit: *unit }).collect();
-    let options = Options {
-        line: LineSettings { baud, parity },
-        heeds_settings: true,
-        faults: faults.iter().map(|fault| fault.parse().expect("a fault")).collect(),
-        ..Options::default()
-    };
-    let simulation = Simulation::new(&devices, options).expect("devices");
-    let port = simulation.serve_pty(None).expect("a pseudo-terminal");
-    (simulation, port)
-}
-
-fn path(port: &PtyPort) -> String {
-    port.path().display().to_string()
-}
+use crate::support::{Ended, Running, program};
+use crate::typed::{found, path, simulated};
 
 fn scan(arguments: &[&str]) -> Output {
     Command::new(program()).arg("scan").args(arguments).output().expect("the program is built")
-}
-
-fn found(output: &Output) -> Value {
-    serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {output:?}"))
 }
 
 const DEVICES: &[(Model, u8)] = &[(Model::MrDo4, 18), (Model::Relay8, 19), (Model::Sensor, 20)];
 
 #[test]
 fn what_it_prints_is_a_configuration_that_the_check_takes_as_it_is() {
-    let (_simulation, port) = line(9600, Parity::None, DEVICES, &[]);
+    let (_simulation, port) = simulated(Some((9600, Parity::None)), DEVICES, &[]);
     let output = scan(&["--serial", &path(&port), "--units", "17..21"]);
     assert_eq!(output.status.code(), Some(0), "{output:?}");
     let said = String::from_utf8_lossy(&output.stderr);
@@ -97,7 +73,7 @@ fn any_bit_rate_and_parity_are_found() {
         (115_200, Parity::None, "none"),
         (2400, Parity::Even, "even"),
     ] {
-        let (_simulation, port) = line(baud, parity, &[(Model::MrAi8, 3)], &[]);
+        let (_simulation, port) = simulated(Some((baud, parity)), &[(Model::MrAi8, 3)], &[]);
         let output = scan(&["--serial", &path(&port), "--units", "3", "--json"]);
         assert_eq!(output.status.code(), Some(0), "{output:?}");
         let found = found(&output);
@@ -111,7 +87,7 @@ fn any_bit_rate_and_parity_are_found() {
 
 #[test]
 fn what_is_known_of_the_line_is_not_tried_otherwise() {
-    let (_simulation, port) = line(9600, Parity::Odd, &[(Model::MrDi4, 2)], &[]);
+    let (_simulation, port) = simulated(Some((9600, Parity::Odd)), &[(Model::MrDi4, 2)], &[]);
     for (arguments, code) in [
         (&["--baud", "9600"][..], 0),
         (&["--parity", "odd"], 0),
@@ -128,7 +104,7 @@ fn what_is_known_of_the_line_is_not_tried_otherwise() {
 fn slow_and_late_devices_are_found_all_the_same() {
     let faults = ["unit=5,slow=150ms", "unit=9,slow=90ms"];
     let devices = [(Model::MrDo4, 5), (Model::MrDi4, 6), (Model::MrAi8, 9)];
-    let (_simulation, port) = line(19200, Parity::Even, &devices, &faults);
+    let (_simulation, port) = simulated(Some((19200, Parity::Even)), &devices, &faults);
     let output = scan(&["--serial", &path(&port), "--units", "1..9", "--json"]);
     let found = found(&output);
     let units: Vec<&Value> =
@@ -154,7 +130,7 @@ fn who_cannot_be_understood_is_told_with_a_remedy_and_no_device() {
             "none of the units 17..20 answers at 19200 8E1; look at the devices' power and units",
         ),
     ] {
-        let (_simulation, port) = line(19200, Parity::Even, &devices, faults);
+        let (_simulation, port) = simulated(Some((19200, Parity::Even)), &devices, faults);
         let place = path(&port);
         let output =
             scan(&["--serial", &place, "--units", "17..20", "--baud", "19200", "--parity", "even", "--json"]);
@@ -169,7 +145,7 @@ fn who_cannot_be_understood_is_told_with_a_remedy_and_no_device() {
 
 #[test]
 fn a_gateway_is_asked_for_its_units_over_modbus_tcp() {
-    let (simulation, _port) = line(19200, Parity::Even, DEVICES, &[]);
+    let (simulation, _port) = simulated(Some((19200, Parity::Even)), DEVICES, &[]);
     let tcp = simulation.serve_tcp("127.0.0.1:0", Framing::Tcp).expect("a socket");
     let rtu = simulation.serve_tcp("127.0.0.1:0", Framing::Rtu).expect("a socket");
     for (option, address, units, asked, key) in [
@@ -192,35 +168,28 @@ fn a_gateway_is_asked_for_its_units_over_modbus_tcp() {
 
 #[test]
 fn an_interrupt_ends_it_with_what_was_found_so_far() {
-    let (_simulation, port) = line(19200, Parity::Even, &[(Model::MrDo4, 2)], &[]);
-    let (output, _) = interrupted(&["--serial", &path(&port), "--json"], "unit 2: METZ CONNECT");
-    assert_eq!(output.status.code(), Some(0), "{output:?}");
-    let found = found(&output);
+    let (_simulation, port) = simulated(Some((19200, Parity::Even)), &[(Model::MrDo4, 2)], &[]);
+    let ended = interrupted(&["--serial", &path(&port), "--json"], "unit 2: METZ CONNECT");
+    assert_eq!(ended.status.code(), Some(0), "{ended:?}");
+    let found: Value = serde_json::from_str(&ended.stdout).expect("JSON");
     assert_eq!(found["complete"], false, "{found}");
     assert_eq!(found["found"][0]["unit"], 2, "{found}");
     let text = found["configuration"].as_str().expect("a text");
     assert!(text.contains("it was interrupted before all of the units 1..247 were asked"), "{text}");
 
-    let (_simulation, port) = line(19200, Parity::Even, &[(Model::MrDo4, 2)], &["silent"]);
-    let (output, said) = interrupted(&["--serial", &path(&port)], "asking 247 units");
-    assert_eq!(output.status.code(), Some(1), "{output:?}");
-    assert!(output.stdout.is_empty(), "{output:?}");
+    let (_simulation, port) = simulated(Some((19200, Parity::Even)), &[(Model::MrDo4, 2)], &["silent"]);
+    let ended = interrupted(&["--serial", &path(&port)], "asking 247 units");
+    assert_eq!(ended.status.code(), Some(1), "{ended:?}");
+    assert!(ended.stdout.is_empty(), "{ended:?}");
+    let said = &ended.stderr;
     assert!(said.contains("interrupted") && said.contains("as far as was asked"), "{said}");
 }
 
-/// Interrupts the scan as soon as it has said this; gives the end, and what was said before and after.
-fn interrupted(arguments: &[&str], sign: &str) -> (Output, String) {
-    let mut scan = Command::new(program());
-    scan.arg("scan").args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped());
-    let mut child: Child = scan.spawn().expect("the program is built");
-    let mut errors = BufReader::new(child.stderr.take().expect("a pipe"));
-    let mut said = String::new();
-    while !said.contains(sign) {
-        assert!(errors.read_line(&mut said).expect("text") > 0, "it ended without `{sign}`: {said}");
-    }
-    kill_process(Pid::from_child(&child), Signal::INT).expect("signalled");
-    errors.read_to_string(&mut said).expect("text");
-    (child.wait_with_output().expect("it ends"), said)
+/// Interrupts the scan as soon as it has said this; gives its end.
+fn interrupted(arguments: &[&str], sign: &str) -> Ended {
+    let scan = Running::start(&[&["scan"], arguments].concat());
+    scan.wait_for(sign);
+    scan.interrupt()
 }
 
 #[test]

@@ -5,6 +5,7 @@
 
 mod broker;
 mod gateway;
+mod running;
 mod watcher;
 
 use std::fs;
@@ -22,6 +23,7 @@ use tempfile::TempDir;
 
 pub use broker::Broker;
 pub use gateway::{Gateway, busker, program};
+pub use running::{Ended, Running};
 pub use watcher::{Received, Watcher};
 
 /// Far longer than anything takes; only a failing test waits for it.
