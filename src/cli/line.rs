@@ -88,7 +88,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let Some(to) = args.set else {
         return Err(args.refused(Refusal::Wish(why_no_unit(&device))));
     };
-    match LineChange::of(&device, from, to).map_err(|refusal| args.refused(refusal))? {
+    match LineChange::of(&device, &interview, from, to).map_err(|refusal| args.refused(refusal))? {
         None => output::print(&format!("unit {} has {from} already; nothing was written\n", args.unit)),
         Some(change) => edge.change(&device, change, may_ask),
     }

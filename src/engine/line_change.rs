@@ -23,6 +23,8 @@ pub enum Refusal {
 #[derive(Clone, Debug)]
 pub struct LineChange {
     identify: Option<Identify>,
+    /// A question that the device has answered, and by which it is known where that can be.
+    who: Call,
     pub from: Line,
     pub to: Line,
     call: Call,
@@ -45,13 +47,12 @@ pub fn profile_of<'a>(interview: &'a Interview, given: Option<&'a Device>) -> Re
             Ok(_) => Ok(profile),
             Err(reason) => Err(Refusal::Device(format!("it is no {profile}: {reason}"))),
         },
-        // It is the person's word, unless the device says that it is another one.
-        (Some(Device { profile, .. }), []) => Ok(profile),
-        (None, [(only, _)]) => Ok(only),
         (Some(Device { profile, .. }), [(other, _), ..]) if other != profile => {
             Err(Refusal::Device(format!("it is no {profile}: it says that it is a {other}")))
         }
+        // It is the person's word, and the device does not say otherwise.
         (Some(Device { profile, .. }), _) => Ok(profile),
+        (None, [(only, _)]) => Ok(only),
         (None, []) => Err(Refusal::Device(
             "no profile goes by what it says; if you know which it is, name it with `--profile`".into(),
         )),
@@ -74,7 +75,12 @@ pub fn why_no_unit(device: &Device) -> String {
 
 impl LineChange {
     /// The change of `device`, which has answered with the settings `from`; `None`: it has them already.
-    pub fn of(device: &Device, from: Line, to: Line) -> Result<Option<LineChange>, Refusal> {
+    pub fn of(
+        device: &Device,
+        interview: &Interview,
+        from: Line,
+        to: Line,
+    ) -> Result<Option<LineChange>, Refusal> {
         let id = &device.profile;
         let register = match device.line.as_ref().map(|line| &line.settings) {
             None => return Err(Refusal::Wish(format!("{id} does not say how bit rate and parity are set"))),
@@ -89,7 +95,44 @@ impl LineChange {
             return Ok(None);
         }
         let call = Call::WriteRegister { address: register.at.first(), word };
-        Ok(Some(LineChange { identify: device.identify.clone(), from, to, call }))
+        let identify = device.identify.clone();
+        // Whoever tells nobody who it is answers this one all the same, if only by a refusal; there are
+        // devices that are silent to all that they do not know.
+        let names = || Call::ReadIdentification { code: 1, object: 0 };
+        let who = match &identify {
+            Some(identify) => question(identify),
+            None => interview.heard_by().cloned().unwrap_or_else(names),
+        };
+        Ok(Some(LineChange { identify, who, from, to, call }))
+    }
+
+    /// What to ask with the old settings just before the write.
+    pub fn question(&self) -> Call {
+        self.who.clone()
+    }
+
+    /// Whether, by its answer, the device may still be written to: it may be another one by now.
+    pub fn allow(&self, result: &Result<Answer, RequestError>) -> Result<(), Refusal> {
+        match self.is_it(result) {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(reason)) => Err(Refusal::Device(format!("another one answers there now: {reason}"))),
+            Err(error) => Err(Refusal::Device(format!("it answers no more: {error}"))),
+        }
+    }
+
+    /// Whether it is the device that has answered; `Err` outside: nobody has.
+    fn is_it<'a>(
+        &self,
+        result: &'a Result<Answer, RequestError>,
+    ) -> Result<Result<(), String>, &'a RequestError> {
+        match (result, &self.identify) {
+            (Ok(answer), Some(identify)) => Ok(check(identify, answer).map(drop)),
+            (Ok(_) | Err(RequestError::Exception(_)), None) => Ok(Ok(())),
+            // Whoever is busy does not say who it is.
+            (Err(busy @ RequestError::Exception(5 | 6)), _) => Err(busy),
+            (Err(error @ RequestError::Exception(_)), _) => Ok(Err(format!("it answers with {error}"))),
+            (Err(error), _) => Err(error),
+        }
     }
 
     /// The one write.
@@ -99,7 +142,7 @@ impl LineChange {
 
     /// What follows the write, of which this was the fate.
     pub fn written(self, result: Result<Answer, RequestError>) -> Verification {
-        Verification { change: self, result, looks: 0, is_over: false, outcome: None }
+        Verification { change: self, result, looks: 0, outcome: None }
     }
 }
 
@@ -130,7 +173,6 @@ pub struct Verification {
     change: LineChange,
     result: Result<Answer, RequestError>,
     looks: usize,
-    is_over: bool,
     outcome: Option<Outcome>,
 }
 
@@ -150,31 +192,24 @@ pub enum Outcome {
 impl Verification {
     /// With which settings to ask what.
     pub fn question(&self) -> Option<(Line, Call)> {
-        let is_new = LOOKS.get(self.looks).filter(|_| !self.is_over)?;
+        let is_new = LOOKS.get(self.looks).filter(|_| self.outcome.is_none())?;
         let line = if *is_new { self.change.to } else { self.change.from };
-        // Whoever tells nobody who it is answers all the same, if only by a refusal.
-        let names = Call::ReadIdentification { code: 1, object: 0 };
-        Some((line, self.change.identify.as_ref().map_or(names, question)))
+        Some((line, self.change.who.clone()))
     }
 
     pub fn answered(&mut self, result: &Result<Answer, RequestError>) {
         let is_new = LOOKS.get(self.looks).copied().unwrap_or_default();
         self.looks += 1;
-        let identified = match (result, &self.change.identify) {
-            (Ok(answer), Some(identify)) => check(identify, answer).map(drop),
-            (Ok(_) | Err(RequestError::Exception(_)), None) => Ok(()),
-            (Err(RequestError::Exception(code)), Some(_)) => Err(format!("it answers with exception {code}")),
-            (Err(_), _) => return,
-        };
-        self.outcome = Some(match (is_new, identified) {
-            (true, Ok(())) => Outcome::Changed,
-            (true, Err(reason)) => Outcome::Another(reason),
-            (false, _) => Outcome::AsBefore(match &self.result {
+        self.outcome = match (is_new, self.change.is_it(result)) {
+            (true, Ok(Ok(()))) => Some(Outcome::Changed),
+            (true, Ok(Err(reason))) => Some(Outcome::Another(reason)),
+            (false, Ok(Ok(()))) => Some(Outcome::AsBefore(match &self.result {
                 Ok(_) => "it has confirmed the write and not obeyed it".into(),
                 Err(error) => format!("the write was not taken: {error}"),
-            }),
-        });
-        self.is_over = true;
+            })),
+            // Another one that has its unit and the old settings says nothing about where it is itself.
+            (false, Ok(Err(_))) | (_, Err(_)) => None,
+        };
     }
 
     pub fn outcome(self) -> Outcome {
@@ -185,6 +220,8 @@ impl Verification {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::address::{Span, Table};
+    use crate::engine::identity::Known;
     use crate::engine::modbus::Identification;
     use crate::engine::profile::Library;
 
@@ -195,10 +232,79 @@ mod tests {
         Library::shipped().load(id).expect("a shipped profile")
     }
 
+    /// What came of asking a device that answers so, by whom these profiles are known.
+    fn heard(known: Known, answer: impl Fn(&Call) -> Result<Answer, RequestError>) -> Interview {
+        let mut interview = Interview::of_stranger(known);
+        while let Some(call) = interview.question() {
+            interview.answered(&answer(&call));
+        }
+        interview
+    }
+
+    fn refuse(_: &Call) -> Result<Answer, RequestError> {
+        Err(RequestError::Exception(1))
+    }
+
+    fn change(id: &str, from: Line, to: Line) -> Result<Option<LineChange>, Refusal> {
+        LineChange::of(&device(id), &heard(Known::default(), refuse), from, to)
+    }
+
     fn names(product: &str) -> Result<Answer, RequestError> {
         let objects =
             [(0, "METZ CONNECT GmbH"), (1, product)].map(|(number, text)| (number, text.to_string()));
         Ok(Answer::Identification(Identification { conformity: 1, next: None, objects: objects.to_vec() }))
+    }
+
+    #[test]
+    fn the_profile_is_the_one_that_fits_or_that_a_person_names() {
+        let goes_by = |id: &str| (id.to_string(), device("metz-connect/mr-do4").identify.expect("names"));
+        let one = || Known::new(vec![goes_by("metz-connect/mr-do4")]);
+        let two = || Known::new(vec![goes_by("metz-connect/mr-do4"), goes_by("acme/copy")]);
+        let do4 = |_: &Call| names("MR-DO4");
+        let di4 = |_: &Call| names("MR-DI4");
+        let silent = |_: &Call| Err(RequestError::Timeout);
+        let named = |id: &str| Some(device(id));
+        // A file of one's own may have the id of a shipped profile, and go by nothing.
+        let own = Some(Device { identify: None, ..device("metz-connect/mr-do4") });
+        let check = |interview: Interview, given: Option<Device>, expected: Result<&str, &str>| {
+            let expected = expected.map_err(|reason| Refusal::Device(reason.into()));
+            assert_eq!(profile_of(&interview, given.as_ref()), expected);
+        };
+        check(
+            heard(one(), silent),
+            named("metz-connect/mr-do4"),
+            Err(
+                "it does not answer with these settings: no answer in time; check its power, its wiring and its unit; \
+                 `busker scan --serial PORT --units UNIT` finds those that it has",
+            ),
+        );
+        check(heard(one(), do4), None, Ok("metz-connect/mr-do4"));
+        check(heard(one(), do4), named("metz-connect/mr-do4"), Ok("metz-connect/mr-do4"));
+        check(
+            heard(one(), di4),
+            named("metz-connect/mr-do4"),
+            Err(
+                "it is no metz-connect/mr-do4: it says that it is `METZ CONNECT GmbH MR-DI4`, not `METZ CONNECT GmbH \
+                 MR-DO4`",
+            ),
+        );
+        check(heard(one(), refuse), named("btr/mr-ai8"), Ok("btr/mr-ai8"));
+        check(
+            heard(one(), do4),
+            named("btr/mr-ai8"),
+            Err("it is no btr/mr-ai8: it says that it is a metz-connect/mr-do4"),
+        );
+        check(heard(two(), do4), own, Ok("metz-connect/mr-do4"));
+        check(
+            heard(one(), di4),
+            None,
+            Err("no profile goes by what it says; if you know which it is, name it with `--profile`"),
+        );
+        check(
+            heard(two(), do4),
+            None,
+            Err("it may be metz-connect/mr-do4 or acme/copy; name it with `--profile`"),
+        );
     }
 
     #[test]
@@ -210,10 +316,10 @@ mod tests {
             ("btr/mr-ai8", Line { baud: 1200, parity: Parity::Odd, stop_bits: 1 }, 0x5321),
         ] {
             let other = Line { baud: 4800, ..OLD };
-            let change = LineChange::of(&device(id), other, to).expect("possible").expect("another");
+            let change = change(id, other, to).expect("possible").expect("another");
             assert_eq!(change.call(), Call::WriteRegister { address: 65, word }, "{id}");
         }
-        assert!(LineChange::of(&device("metz-connect/mr-do4"), OLD, OLD).expect("possible").is_none());
+        assert!(change("metz-connect/mr-do4", OLD, OLD).expect("possible").is_none());
     }
 
     #[test]
@@ -231,7 +337,7 @@ mod tests {
                  to 3 set parity and stop bits, 4 and 5 the bit rate",
             ),
         ] {
-            let refused = LineChange::of(&device(id), OLD, to).expect_err("not possible");
+            let refused = change(id, OLD, to).expect_err("not possible");
             assert_eq!(refused, Refusal::Wish(reason.into()));
         }
         let unit = why_no_unit(&device("metz-connect/mr-do4"));
@@ -256,8 +362,7 @@ mod tests {
         expected: Outcome,
         looks: usize,
     ) {
-        let change =
-            LineChange::of(&device("metz-connect/mr-do4"), OLD, NEW).expect("possible").expect("another");
+        let change = change("metz-connect/mr-do4", OLD, NEW).expect("possible").expect("another");
         let mut verification = change.written(written);
         let mut asked = 0;
         while let Some((line, call)) = verification.question() {
@@ -294,5 +399,64 @@ mod tests {
         let another =
             "it says that it is `METZ CONNECT GmbH MR-DI4`, not `METZ CONNECT GmbH MR-DO4`".to_string();
         check(done(), |_, _| names("MR-DI4"), Outcome::Another(another), 1);
+    }
+
+    #[test]
+    fn whoever_is_busy_or_another_at_the_old_settings_says_nothing_of_where_the_device_is() {
+        let done = || Ok(Answer::Written);
+        let busy = |line: Line, look: usize| match (line == NEW, look) {
+            (true, 0) => Err(RequestError::Exception(6)),
+            (true, 1) => Err(RequestError::Exception(5)),
+            _ => names("MR-DO4"),
+        };
+        check(done(), busy, Outcome::Changed, 3);
+        check(done(), |_, _| Err(RequestError::Exception(6)), Outcome::Lost, 6);
+        let another = "it answers with exception 1 (illegal function)".to_string();
+        check(done(), |_, _| Err(RequestError::Exception(1)), Outcome::Another(another), 1);
+        let other_at_the_old = |line: Line, look: usize| match (line == OLD, look) {
+            (true, _) => names("MR-DI4"),
+            (false, 5) => names("MR-DO4"),
+            (false, _) => Err(RequestError::Timeout),
+        };
+        check(done(), other_at_the_old, Outcome::Changed, 6);
+    }
+
+    #[test]
+    fn a_device_that_tells_nobody_who_it_is_is_asked_what_it_has_answered_before() {
+        let any_register = Call::Read(Span::single(Table::Holding, 0));
+        let silent_to_what_it_does_not_know = |call: &Call| match call {
+            Call::Read(_) => Err(RequestError::Exception(2)),
+            _ => Err(RequestError::Timeout),
+        };
+        let interview = heard(Known::default(), silent_to_what_it_does_not_know);
+        let change =
+            LineChange::of(&device("btr/mr-ai8"), &interview, OLD, NEW).expect("possible").expect("another");
+        assert_eq!(change.question(), any_register);
+        assert_eq!(change.allow(&silent_to_what_it_does_not_know(&any_register)), Ok(()));
+        let mut verification = change.written(Ok(Answer::Written));
+        assert_eq!(verification.question(), Some((NEW, any_register.clone())));
+        verification.answered(&silent_to_what_it_does_not_know(&any_register));
+        assert_eq!(verification.outcome(), Outcome::Changed);
+    }
+
+    #[test]
+    fn just_before_the_write_it_must_still_be_the_device() {
+        let change = change("metz-connect/mr-do4", OLD, NEW).expect("possible").expect("another");
+        assert_eq!(change.question(), Call::ReadIdentification { code: 1, object: 0 });
+        for (answer, refused) in [
+            (names("MR-DO4"), None),
+            (
+                names("MR-DI4"),
+                Some(
+                    "another one answers there now: it says that it is `METZ CONNECT GmbH MR-DI4`, not \
+                     `METZ CONNECT GmbH MR-DO4`",
+                ),
+            ),
+            (Err(RequestError::Timeout), Some("it answers no more: no answer in time")),
+            (Err(RequestError::Exception(6)), Some("it answers no more: exception 6 (device busy)")),
+        ] {
+            let refused = refused.map_or(Ok(()), |reason: &str| Err(Refusal::Device(reason.into())));
+            assert_eq!(change.allow(&answer), refused);
+        }
     }
 }

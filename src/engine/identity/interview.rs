@@ -50,7 +50,7 @@ pub struct Interview {
     objects_error: Option<RequestError>,
     server_id: Option<Result<Vec<u8>, RequestError>>,
     words: Vec<(Span, Result<Answer, RequestError>)>,
-    heard: bool,
+    heard_by: Option<Call>,
 }
 
 #[derive(Clone, Debug)]
@@ -99,7 +99,7 @@ impl Interview {
             objects_error: None,
             server_id: None,
             words: Vec::new(),
-            heard: false,
+            heard_by: None,
         }
     }
 
@@ -116,7 +116,9 @@ impl Interview {
     pub fn answered(&mut self, result: &Result<Answer, RequestError>) {
         // A refusal is an answer, silence is not.
         let is_heard = matches!(result, Ok(_) | Err(RequestError::Exception(_)));
-        self.heard |= is_heard;
+        if is_heard && self.heard_by.is_none() {
+            self.heard_by = self.question();
+        }
         match self.step {
             Step::Objects { code, object } => {
                 let next = match result {
@@ -182,7 +184,8 @@ impl Interview {
 
     fn ask_any_register(&mut self) {
         let has_asked = self.words.iter().any(|(at, _)| *at == ANY_REGISTER);
-        if matches!(self.whom, Whom::Stranger) && self.registers.is_empty() && !self.heard && !has_asked {
+        if matches!(self.whom, Whom::Stranger) && self.registers.is_empty() && !self.was_heard() && !has_asked
+        {
             self.registers.push_back(ANY_REGISTER);
         }
     }
@@ -206,7 +209,12 @@ impl Interview {
 
     /// Whether the device has answered anything, if only by a refusal.
     pub fn was_heard(&self) -> bool {
-        self.heard
+        self.heard_by.is_some()
+    }
+
+    /// The first question that it has answered.
+    pub fn heard_by(&self) -> Option<&Call> {
+        self.heard_by.as_ref()
     }
 
     /// The objects of function 43/14 by their numbers.
