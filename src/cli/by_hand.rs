@@ -8,7 +8,7 @@ use super::characters::Characters;
 use super::{Failure, configuration, profiles};
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
-use crate::edge::link::Link;
+use crate::edge::link::{Link, Lost};
 use crate::engine::address::Span;
 use crate::engine::codec::{self, Raw};
 use crate::engine::command::{CommandFlow, Outcome, Step, words_of};
@@ -17,7 +17,7 @@ use crate::engine::identity::{self, Interview};
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
 use crate::engine::profile::Library;
-use crate::engine::settings::{self, Rs485};
+use crate::engine::settings::{self, Line, Rs485};
 use crate::engine::time::Duration;
 use crate::engine::yaml::Scalar;
 
@@ -63,12 +63,27 @@ struct WhichLine {
 /// A device that can be asked.
 pub struct Asked {
     link: GuardedLink,
-    unit: u8,
     /// Unit 0 is every unit: on RTU, but not on Modbus TCP.
     broadcasts: bool,
-    timeout: Duration,
-    /// Its profile, where the configuration names one.
+    whom: Addressee,
+}
+
+/// Whom a question is for, and the rules of its profile, where that is known.
+pub struct Addressee {
+    pub unit: u8,
+    /// How long a reply may take, unless the profile wants it longer.
+    pub timeout: Duration,
     pub device: Option<Device>,
+}
+
+/// One port or address, opened with one line's settings after the other.
+pub struct Reach {
+    link: settings::Link,
+    clock: Clock,
+    /// Silence behind each opening.
+    pub connect_delay: Duration,
+    /// With the settings that it was opened with.
+    open: Option<(Option<Line>, GuardedLink)>,
 }
 
 /// A question's fate: the device's word, or why there is none.
@@ -95,8 +110,7 @@ impl ByHand {
             return Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")));
         }
         let device = self.profile.as_deref().map(profiles::load).transpose()?;
-        let demanded = device.as_ref().and_then(|device| device.wire.response_timeout);
-        open(&link, None, unit, demanded.unwrap_or_default().max(self.timeout), device)
+        open(&link, None, Addressee { unit, timeout: self.timeout, device })
     }
 
     /// The profiles that are known: the shipped ones, and over them those of the configuration.
@@ -115,25 +129,20 @@ impl ByHand {
         let name = self.device.as_deref().unwrap_or_default();
         let device = configuration::device_named(&settings, name)?;
         let bus = &settings.buses[device.bus];
-        let timeout = device.device.wire.response_timeout.unwrap_or_default().max(bus.response_timeout);
-        open(&bus.link, bus.gap, device.unit, timeout, Some(Device::clone(&device.device)))
+        let own = Some(Device::clone(&device.device));
+        let whom = Addressee { unit: device.unit, timeout: bus.response_timeout, device: own };
+        open(&bus.link, bus.gap, whom)
     }
 }
 
-fn open(
-    link: &settings::Link,
-    gap: Option<Duration>,
-    unit: u8,
-    timeout: Duration,
-    device: Option<Device>,
-) -> Result<Asked, Failure> {
+fn open(link: &settings::Link, gap: Option<Duration>, whom: Addressee) -> Result<Asked, Failure> {
     let opened = Link::open(link).map_err(|lost| anyhow!("{lost}"))?;
     let broadcasts = !matches!(link, settings::Link::Tcp { .. });
-    if let Some(device) = &device {
+    if let Some(device) = &whom.device {
         std::thread::sleep(device.wire.connect_delay);
     }
     let link = GuardedLink::new(opened, Guard::new(link, gap), Clock::start());
-    Ok(Asked { link, unit, broadcasts, timeout, device })
+    Ok(Asked { link, broadcasts, whom })
 }
 
 pub fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
@@ -148,36 +157,76 @@ pub fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
     }
 }
 
-impl Asked {
-    pub fn unit(&self) -> u8 {
-        self.unit
-    }
-
-    /// Whether what is asked goes to all units of the line, of which none answers.
-    pub fn is_broadcast(&self) -> bool {
-        self.unit == 0 && self.broadcasts
-    }
-
-    /// One question. `Err` outside: the line is lost.
-    pub fn ask(&mut self, call: &Call) -> Result<Answered, Failure> {
-        if let Some(device) = &self.device {
-            std::thread::sleep(device.wire.limits.delay);
+impl Addressee {
+    /// One question. `Err` outside: the line is lost, or it cannot be asked.
+    pub fn ask(&self, link: &mut GuardedLink, call: &Call) -> Result<Answered, Failure> {
+        let (mut timeout, mut any_exception) = (self.timeout, false);
+        if let Some(wire) = self.device.as_ref().map(|device| &device.wire) {
+            std::thread::sleep(wire.limits.delay);
+            timeout = timeout.max(wire.response_timeout.unwrap_or_default());
+            any_exception = wire.quirks.exception_function_varies;
         }
-        let quirks = self.device.as_ref().map(|device| device.wire.quirks).unwrap_or_default();
-        let any_exception = quirks.exception_function_varies;
         let request = Request { any_exception, ..Request::new(self.unit, call.clone()) };
-        let reply = self.link.ask(&request, self.timeout).map_err(|lost| anyhow!("{lost}"))?;
+        let reply = link.ask(&request, timeout).map_err(|lost| anyhow!("{lost}"))?;
         match reply.result {
             Err(RequestError::Impossible(reason)) => Err(Failure::wrong(format!("{call}: {reason}"))),
             result => Ok(result),
         }
+    }
+}
+
+impl Reach {
+    pub fn new(link: settings::Link, clock: Clock) -> Reach {
+        Reach { link, clock, connect_delay: Duration::ZERO, open: None }
+    }
+
+    /// The link, open with these settings (of Modbus TCP none) and strict about parity.
+    pub fn at(&mut self, line: Option<Line>) -> Result<&mut GuardedLink, Lost> {
+        // What is open with others is closed first, since a port is open only once.
+        let open = match self.open.take().filter(|(open, _)| *open == line) {
+            Some(open) => open,
+            None => (line, self.opened(line)?),
+        };
+        Ok(&mut self.open.insert(open).1)
+    }
+
+    fn opened(&self, line: Option<Line>) -> Result<GuardedLink, Lost> {
+        use settings::Link::{RtuOverTcp, Serial};
+        let mut link = self.link.clone();
+        if let (Serial { line: set, .. } | RtuOverTcp { line: set, .. }, Some(line)) = (&mut link, line) {
+            *set = line;
+        }
+        let opened = Link::open_strict(&link)?;
+        std::thread::sleep(self.connect_delay);
+        Ok(GuardedLink::new(opened, Guard::new(&link, None), self.clock))
+    }
+}
+
+impl Asked {
+    pub fn unit(&self) -> u8 {
+        self.whom.unit
+    }
+
+    /// Its profile, where one is named.
+    pub fn device(&self) -> Option<&Device> {
+        self.whom.device.as_ref()
+    }
+
+    /// Whether what is asked goes to all units of the line, of which none answers.
+    pub fn is_broadcast(&self) -> bool {
+        self.unit() == 0 && self.broadcasts
+    }
+
+    /// One question. `Err` outside: the line is lost.
+    pub fn ask(&mut self, call: &Call) -> Result<Answered, Failure> {
+        self.whom.ask(&mut self.link, call)
     }
 
     /// What the device says of itself, if it is the one of its profile. Without anything to identify it by
     /// there is nothing to say.
     pub fn identify(&mut self, device: &Device) -> Result<Option<String>, Failure> {
         let Some(identify) = &device.identify else { return Ok(None) };
-        let unit = self.unit;
+        let unit = self.unit();
         let answer = match self.ask(&identity::question(identify))? {
             Ok(answer) => answer,
             Err(error) => {
@@ -236,7 +285,7 @@ impl Asked {
 
     /// The point that is called `name`, and the device that knows it.
     pub fn point(&self, name: &str) -> Result<(Device, PointIndex), Failure> {
-        let Some(device) = &self.device else {
+        let Some(device) = self.device() else {
             return Err(Failure::wrong(format!(
                 "`{name}` is no address; expected one like `holding 0..3`, or a point's name with --config and --device, or with --profile"
             )));
@@ -276,7 +325,7 @@ impl Asked {
     }
 
     fn asking(&self, span: Span) -> String {
-        format!("unit {}: `{span}` cannot be read", self.unit)
+        format!("unit {}: `{span}` cannot be read", self.unit())
     }
 }
 

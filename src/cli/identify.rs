@@ -32,7 +32,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let mut known = identity::known(&args.device.library()?);
     let mut asked = args.device.open()?;
     let unit = asked.unit();
-    let device = asked.device.clone();
+    let device = asked.device().cloned();
     if let Some(Device { profile, identify: Some(identify), .. }) = &device {
         // A file of a profile may be none of those that everybody knows.
         if !known.iter().any(|(id, _)| id == profile) {

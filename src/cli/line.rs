@@ -4,15 +4,14 @@ use std::io::{self, BufRead, IsTerminal};
 
 use anyhow::anyhow;
 
+use super::by_hand::{Addressee, Reach};
 use super::{Failure, output, profiles};
 use crate::edge::clock::Clock;
-use crate::edge::guarded_link::GuardedLink;
-use crate::edge::link::Link;
+use crate::edge::link::Lost;
 use crate::engine::device::Device;
 use crate::engine::identity::{self, Interview};
 use crate::engine::line_change::{LineChange, Outcome, Refusal, profile_of, why_no_unit};
-use crate::engine::modbus::guard::Guard;
-use crate::engine::modbus::{Answer, Call, Request, RequestError};
+use crate::engine::modbus::{Answer, Call, RequestError};
 use crate::engine::profile::Library;
 use crate::engine::settings::{self, Line, Parity, Rs485};
 use crate::engine::time::Duration;
@@ -76,13 +75,16 @@ pub fn run(args: Args) -> Result<(), Failure> {
     }
     let given = args.profile.as_deref().map(profiles::load).transpose()?;
     let from = Line { baud: args.baud, parity: args.parity, stop_bits: 1 };
-    let mut edge = Edge { args: &args, clock: Clock::start(), open: None };
+    let mut edge = Edge::new(&args, from);
+    // Its rules hold from the first question on.
+    edge.knows(given.as_ref());
     let interview = edge.interview(from)?;
     let profile = profile_of(&interview, given.as_ref()).map_err(|refusal| args.refused(refusal))?;
     let device = match given {
         Some(given) => given,
         None => profiles::load(profile)?,
     };
+    edge.knows(Some(&device));
     let who = interview.names().unwrap_or_else(|| "a device that does not tell its names".into());
     eprintln!("unit {} at {from}: {who} ({})", args.unit, device.profile);
     let Some(to) = args.set else {
@@ -122,11 +124,23 @@ fn parity_name(parity: Parity) -> &'static str {
 /// What talks to the device.
 struct Edge<'a> {
     args: &'a Args,
-    clock: Clock,
-    open: Option<(Line, GuardedLink)>,
+    reach: Reach,
+    whom: Addressee,
 }
 
 impl Edge<'_> {
+    fn new(args: &Args, line: Line) -> Edge<'_> {
+        let link = settings::Link::Serial { path: args.serial.clone(), line, rs485: Rs485::Auto };
+        let whom = Addressee { unit: args.unit, timeout: args.timeout, device: None };
+        Edge { args, reach: Reach::new(link, Clock::start()), whom }
+    }
+
+    /// From here on it is asked by the rules of this profile.
+    fn knows(&mut self, device: Option<&Device>) {
+        self.whom.device = device.cloned();
+        self.reach.connect_delay = device.map(|device| device.wire.connect_delay).unwrap_or_default();
+    }
+
     fn interview(&mut self, line: Line) -> Result<Interview, Failure> {
         let library = Library::shipped();
         let mut interview = Interview::of_stranger(identity::known(&library));
@@ -138,12 +152,24 @@ impl Edge<'_> {
 
     fn change(&mut self, device: &Device, change: LineChange, may_ask: bool) -> Result<(), Failure> {
         let (unit, from, to) = (self.args.unit, change.from, change.to);
-        eprintln!("it shall have {to} instead of {from}; that is kept in its EEPROM");
+        eprintln!("it shall have {to} instead of {from}");
+        let nothing = |failure: Failure| failure.context("nothing was written");
+        // A port that does not take the new settings could not look for the device behind the write.
+        self.open(to).map_err(nothing)?;
         let may_write = self.args.yes || (may_ask && says_yes()?);
         if !may_write {
             return Err(anyhow!("nothing was written").into());
         }
-        let written = self.ask(from, &change.call())?;
+        // It may have been exchanged while somebody thought about it; and of a link that was opened anew nobody knows
+        // yet whether it returns what is sent, which a confirmation would look like.
+        let who = self.ask(from, &change.question()).map_err(nothing)?;
+        change.allow(&who).map_err(|refusal| self.args.refused(refusal))?;
+        let sent = move |failure: Failure| {
+            failure.context(format!(
+                "unit {unit} was sent the settings {to}, and has these or still {from}; `busker scan` finds out which"
+            ))
+        };
+        let written = self.ask(from, &change.call()).map_err(sent)?;
         let told = match &written {
             Ok(_) => "written".to_string(),
             Err(error) => format!("sent, and not confirmed: {error}"),
@@ -151,7 +177,7 @@ impl Edge<'_> {
         eprintln!("{told}; looking for it");
         let mut verification = change.written(written);
         while let Some((line, call)) = verification.question() {
-            verification.answered(&self.ask(line, &call)?);
+            verification.answered(&self.ask(line, &call).map_err(sent)?);
         }
         match verification.outcome() {
             Outcome::Changed => {
@@ -176,18 +202,13 @@ impl Edge<'_> {
         }
     }
 
+    fn open(&mut self, line: Line) -> Result<(), Failure> {
+        self.reach.at(Some(line)).map(drop).map_err(|Lost(why)| anyhow!(why).into())
+    }
+
     fn ask(&mut self, line: Line, call: &Call) -> Result<Result<Answer, RequestError>, Failure> {
-        if self.open.as_ref().is_none_or(|(open, _)| *open != line) {
-            // First, since a port is open only once.
-            self.open = None;
-            let path = self.args.serial.clone();
-            let link = settings::Link::Serial { path, line, rs485: Rs485::Auto };
-            let opened = Link::open_strict(&link).map_err(|lost| anyhow!("{lost}"))?;
-            self.open = Some((line, GuardedLink::new(opened, Guard::new(&link, None), self.clock)));
-        }
-        let Some((_, link)) = &mut self.open else { return Ok(Err(RequestError::Timeout)) };
-        let request = Request::new(self.args.unit, call.clone());
-        Ok(link.ask(&request, self.args.timeout).map_err(|lost| anyhow!("{lost}"))?.result)
+        let link = self.reach.at(Some(line)).map_err(|Lost(why)| anyhow!(why))?;
+        self.whom.ask(link, call)
     }
 }
 

@@ -110,6 +110,15 @@ impl Failure {
         }
     }
 
+    /// The same failure, with what it means for what was wanted.
+    pub fn context(self, what: impl std::fmt::Display + Send + Sync + 'static) -> Failure {
+        match self {
+            Failure::Failed(error) => Failure::Failed(error.context(what)),
+            Failure::WrongInput(error) => Failure::WrongInput(error.context(what)),
+            other => other,
+        }
+    }
+
     /// All of it as a text of its own, for where nobody reads standard error.
     pub fn to_text(&self) -> String {
         match self {

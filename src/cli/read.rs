@@ -44,7 +44,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
 
 /// A read of some registers stops outputs or ends the device's answers; the profile says which.
 fn refuse_forbidden(device: &Asked, span: Span) -> Result<(), Failure> {
-    let forbidden = device.device.iter().flat_map(|device| &device.wire.forbidden);
+    let forbidden = device.device().into_iter().flat_map(|device| &device.wire.forbidden);
     match forbidden.into_iter().find(|forbidden| forbidden.span.overlaps(span)) {
         Some(forbidden) => Err(Failure::wrong(format!(
             "`{span}` holds the forbidden `{}`: {}",

@@ -82,7 +82,7 @@ fn dump(by_hand: &ByHand) -> Result<(), Failure> {
 /// The device with its profile, without which nobody knows its settings.
 fn open(by_hand: &ByHand) -> Result<(Asked, Device), Failure> {
     let asked = by_hand.open()?;
-    match asked.device.clone() {
+    match asked.device().cloned() {
         Some(device) => Ok((asked, device)),
         None => Err(Failure::wrong(
             "only a profile knows a device's settings; give --profile beside the unit, or --config and --device",

@@ -56,7 +56,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let span = span_to_write(span, words.len())?;
     let call = call(span, &words, args.with)?;
     let mut device = args.device.open()?;
-    if let Some(profile) = &device.device {
+    if let Some(profile) = device.device() {
         // The profile's rules are by point, and a bare register would go round them.
         return Err(Failure::wrong(format!(
             "with a profile only points are written, by the rules of {}; `busker profiles show {0}` lists them",

@@ -1,45 +1,26 @@
 //! `busker line` as somebody types it: a device whose line settings are changed, or not, and what is said of it.
 
+use std::fs;
 use std::process::{Command, Output, Stdio};
 
-use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
+use busker::engine::time::Duration;
+use busker::simulator::{Model, Parity, PtyPort, Simulation};
 
-use busker::simulator::{DeviceAt, LineSettings, Model, Options, Parity, PtyPort, Simulation};
-
-use crate::peer::{Framing, Peer, Step, exception, rtu};
+use crate::peer::{Asked, Framing, Peer, Step, exception, rtu};
 use crate::support::program;
+use crate::typed::{check, path, simulated, terminal};
 
 /// Devices that hear only who speaks with their bit rate and parity: 9600 8N1.
 fn devices(faults: &[&str]) -> (Simulation, PtyPort) {
-    let devices = [(Model::MrDo4, 18), (Model::Relay8, 19), (Model::BtrMrAi8, 20), (Model::MrDi4, 21)];
-    let devices = devices.map(|(model, unit)| DeviceAt { model, unit });
-    let options = Options {
-        line: LineSettings { baud: 9600, parity: Parity::None },
-        heeds_settings: true,
-        faults: faults.iter().map(|fault| fault.parse().expect("a fault")).collect(),
-        ..Options::default()
-    };
-    let simulation = Simulation::new(&devices, options).expect("devices");
-    let port = simulation.serve_pty(None).expect("a pseudo-terminal");
-    (simulation, port)
+    let models = [(Model::MrDo4, 18), (Model::Relay8, 19), (Model::BtrMrAi8, 20), (Model::MrDi4, 21)];
+    simulated(Some((9600, Parity::None)), &models, faults)
 }
 
 fn line(port: &PtyPort, arguments: &str) -> Output {
-    let path = port.path().display().to_string();
     let words = arguments.split(' ').filter(|word| !word.is_empty());
     let mut line = Command::new(program());
-    line.args(["line", "--serial", &path]).args(words).stdin(Stdio::null());
+    line.args(["line", "--serial", &path(port)]).args(words).stdin(Stdio::null());
     line.output().expect("the program is built")
-}
-
-fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&[&output.stdout[..], &output.stderr[..]].concat()).into_owned()
-}
-
-#[track_caller]
-fn check(output: &Output, code: i32, says: &str) {
-    assert_eq!(output.status.code(), Some(code), "{output:?}");
-    assert!(said(output).contains(says), "`{says}` in {}", said(output));
 }
 
 const OLD: &str = "--baud 9600 --parity none";
@@ -107,15 +88,22 @@ fn what_cannot_be_is_refused_with_what_would_be_right() {
 
 #[test]
 fn a_device_that_cannot_be_understood_is_not_written_to() {
-    let (_simulation, port) = devices(&["unit=18,garbled"]);
-    let output = line(&port, &format!("{OLD} --unit 18 --set 19200,even --yes"));
+    let peer = Peer::on_a_pseudo_terminal();
+    peer.misbehave(|_, mut good| {
+        let middle = good.len() / 2;
+        good[middle] ^= 0x10;
+        vec![Step::Say(good)]
+    });
+    let output = change(&peer, &["--yes", "--timeout", "300ms"], Stdio::null());
     check(&output, 1, "it does not answer with these settings: checksum error; check the wire");
+    assert!(!peer.asked().is_empty());
+    assert_eq!(writes(&peer), Vec::<Vec<u8>>::new());
 }
 
 #[test]
 fn a_write_whose_answer_is_lost_is_looked_for_and_found_done() {
-    // Each third request of it is left unanswered, and obeyed: names, server id, the write.
-    let (_simulation, port) = devices(&["unit=18,every=3,garbled"]);
+    // The answer to each fourth request is garbled, and the request obeyed: names, server id, names, the write.
+    let (_simulation, port) = devices(&["unit=18,every=4,garbled"]);
     let output = line(&port, &format!("{OLD} --unit 18 --set 19200,even --yes"));
     check(&output, 0, "sent, and not confirmed: checksum error; looking for it");
     assert_eq!(String::from_utf8_lossy(&output.stdout), "unit 18 has 19200 8E1 now\n");
@@ -127,25 +115,29 @@ fn impostor(silent: usize) -> Peer {
     let peer = Peer::on_a_pseudo_terminal();
     let mut left = 0;
     peer.misbehave(move |asked, _| {
-        let object = |number: u8, text: &str| [&[number, text.len() as u8], text.as_bytes()].concat();
         if left > 0 {
             left -= 1;
             return vec![];
         }
-        match asked.function {
-            43 => {
-                let names = [object(0, "METZ CONNECT GmbH"), object(1, "MR-DO4")].concat();
-                let pdu = [vec![43, 14, 1, 1, 0, 0, 2], names].concat();
-                vec![Step::Say(rtu(asked.unit, &pdu))]
-            }
-            6 => {
-                left = silent;
-                vec![Step::Say(asked.frame.clone())]
-            }
-            _ => vec![Step::Say(exception(asked, Framing::Rtu, 1))],
+        if asked.function == 6 {
+            left = silent;
         }
+        vec![Step::Say(answer_of_an_mr_do4(asked))]
     });
     peer
+}
+
+/// Its names, and that it takes each write.
+fn answer_of_an_mr_do4(asked: &Asked) -> Vec<u8> {
+    let object = |number: u8, text: &str| [&[number, text.len() as u8], text.as_bytes()].concat();
+    match asked.function {
+        43 => {
+            let names = [object(0, "METZ CONNECT GmbH"), object(1, "MR-DO4")].concat();
+            rtu(asked.unit, &[vec![43, 14, 1, 1, 0, 0, 2], names].concat())
+        }
+        6 => asked.frame.clone(),
+        _ => exception(asked, Framing::Rtu, 1),
+    }
 }
 
 /// What becomes of a change of it, with this on standard input.
@@ -192,6 +184,83 @@ fn one_write_goes_to_one_device_and_what_it_answers_then_says_in_which_state_it_
     }
 }
 
+/// An MR-DO4 of which the port is gone from its answer to this function on.
+fn on_a_port_that_goes(function: u8) -> Peer {
+    let peer = Peer::on_a_pseudo_terminal();
+    let path = peer.path();
+    peer.misbehave(move |asked, _| {
+        if asked.function == function {
+            fs::remove_file(&path).expect("it goes once");
+        }
+        vec![Step::Say(answer_of_an_mr_do4(asked))]
+    });
+    peer
+}
+
+#[test]
+fn a_port_that_does_not_open_with_the_new_settings_is_found_out_before_the_write() {
+    let peer = on_a_port_that_goes(17);
+    let output = change(&peer, &["--yes", "--timeout", "3s"], Stdio::null());
+    check(&output, 1, "error: nothing was written\n  because: `");
+    check(&output, 1, "is the adapter plugged in?");
+    assert_eq!(writes(&peer), Vec::<Vec<u8>>::new());
+}
+
+#[test]
+fn a_device_that_has_been_exchanged_before_the_write_is_not_written_to() {
+    let peer = Peer::on_a_pseudo_terminal();
+    let mut is_another = false;
+    peer.misbehave(move |asked, _| {
+        let answer = if is_another { exception(asked, Framing::Rtu, 1) } else { answer_of_an_mr_do4(asked) };
+        is_another |= asked.function == 17;
+        vec![Step::Say(answer)]
+    });
+    let output = change(&peer, &["--yes", "--timeout", "3s"], Stdio::null());
+    check(&output, 1, "another one answers there now: it answers with exception 1");
+    assert_eq!(writes(&peer), Vec::<Vec<u8>>::new());
+}
+
+#[test]
+fn where_the_port_is_gone_behind_the_write_it_is_told_what_was_written() {
+    let peer = on_a_port_that_goes(6);
+    let output = change(&peer, &["--yes", "--timeout", "3s"], Stdio::null());
+    let told = "error: unit 1 was sent the settings 9600 8N1, and has these or still 19200 8E1; `busker scan` finds out \
+                which\n  because: `";
+    check(&output, 1, told);
+    assert_eq!(writes(&peer).len(), 1);
+}
+
+#[test]
+fn what_the_profile_demands_of_a_question_holds_for_these_as_well() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let profile = folder.path().join("slow.yaml");
+    let text = "\
+device: acme/slow
+manufacturer: ACME
+model: Slow
+source: its manual
+identify: {vendor: METZ CONNECT GmbH, product: MR-DO4}
+wire: {response_timeout: 5s, limits: {delay: 60ms}, quirks: [exception_function_varies]}
+line: {unit: a switch, at: holding 65, add: 0x5300, baud: {9600: 0x04, 19200: 0x05}, parity: {even: 0x10, none: 0x30}}
+points: {flow: {at: input 0, poll: slow}}
+";
+    fs::write(&profile, text).expect("a file");
+    let peer = Peer::on_a_pseudo_terminal();
+    peer.misbehave(|asked, _| {
+        let answer = match asked.function {
+            6 => rtu(asked.unit, &[0x83, 4]),
+            _ => answer_of_an_mr_do4(asked),
+        };
+        vec![Step::Pause(600), Step::Say(answer)]
+    });
+    let profile = profile.display().to_string();
+    let output = change(&peer, &["--yes", "--timeout", "200ms", "--profile", &profile], Stdio::null());
+    check(&output, 0, "sent, and not confirmed: exception 4");
+    let silences: Vec<_> = peer.asked().iter().skip(1).map(|asked| asked.silence).collect();
+    assert_eq!(silences.len(), 4);
+    assert!(silences.iter().all(|silence| *silence >= Duration::from_millis(60)), "{silences:?}");
+}
+
 #[test]
 fn at_a_terminal_somebody_is_asked_and_only_a_yes_writes() {
     for (typed, code, says, count) in [
@@ -199,10 +268,8 @@ fn at_a_terminal_somebody_is_asked_and_only_a_yes_writes() {
         ("y\n", 1, "nothing was written", 0),
         ("\n", 1, "write it?", 0),
     ] {
-        let far = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
-        unlockpt(&far).expect("a pseudo-terminal");
-        let name = ptsname(&far, Vec::new()).expect("its name").into_string().expect("plain letters");
-        let terminal = std::fs::File::options().read(true).write(true).open(name).expect("a terminal");
+        let (far, near) = terminal();
+        let terminal = std::fs::File::options().read(true).write(true).open(near).expect("a terminal");
         rustix::io::write(&far, typed.as_bytes()).expect("typed");
         let peer = impostor(0);
         let output = change(&peer, &["--timeout", "3s"], terminal.into());
@@ -213,7 +280,7 @@ fn at_a_terminal_somebody_is_asked_and_only_a_yes_writes() {
 
 #[test]
 fn a_device_that_refuses_stays_with_its_settings() {
-    let (_simulation, port) = devices(&["unit=18,every=3,exception=4"]);
+    let (_simulation, port) = devices(&["unit=18,every=4,exception=4"]);
     let output = line(&port, &format!("{OLD} --unit 18 --set 19200,even --yes"));
     check(&output, 1, "unit 18 has 9600 8N1 as before: the write was not taken: exception 4");
 }
