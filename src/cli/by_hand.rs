@@ -190,6 +190,16 @@ impl Reach {
         Ok(&mut self.open.insert(open).1)
     }
 
+    /// The settings that it is open with; `None`: it is not.
+    pub fn open_with(&self) -> Option<Option<Line>> {
+        self.open.as_ref().map(|(line, _)| *line)
+    }
+
+    /// Forgets a link that is of no use any more.
+    pub fn close(&mut self) {
+        self.open = None;
+    }
+
     fn opened(&self, line: Option<Line>) -> Result<GuardedLink, Lost> {
         use settings::Link::{RtuOverTcp, Serial};
         let mut link = self.link.clone();

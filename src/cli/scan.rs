@@ -7,14 +7,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::anyhow;
 
-use super::by_hand::host_and_port;
+use super::by_hand::{Reach, host_and_port};
 use super::{Failure, output};
 use crate::edge::clock::Clock;
-use crate::edge::guarded_link::GuardedLink;
-use crate::edge::link::{Link, Lost, adapter};
+use crate::edge::link::{Lost, adapter};
 use crate::edge::shutdown::{Heard, Signals};
 use crate::engine::identity;
-use crate::engine::modbus::guard::Guard;
 use crate::engine::profile::Library;
 use crate::engine::scan::{self, Place, Progress, Question, Report, Scan, Wanted};
 use crate::engine::settings::{self, Line, Parity, Rs485};
@@ -97,25 +95,27 @@ pub fn run(args: Args) -> Result<(), Failure> {
         known: identity::known(&library),
         nameless: identity::nameless(&library),
         timeout: args.timeout,
+        of_server: args.line.serial.is_none(),
     };
     let interrupted = interrupted()?;
     let mut scan = Scan::new(wanted);
-    let mut edge = Edge { site, clock: Clock::start(), open: None };
+    let clock = Clock::start();
+    let mut reach = Reach::new(site.link, clock);
     // What cannot be opened at all is told before anything is promised.
-    if let Err(Lost(why)) = edge.open(scan.progress().line) {
+    if let Err(Lost(why)) = reach.at(scan.progress().line) {
         return Err(anyhow!("{why}").into());
     }
-    eprintln!("{}", promise(&scan, &edge.site.shown));
-    let mut teller = Teller::new(edge.clock);
-    let ended = edge.scan(&mut scan, &mut teller, &interrupted);
+    eprintln!("{}", promise(&scan, &site.shown));
+    let mut teller = Teller::new(clock);
+    let ended = carry_out(&mut reach, &mut scan, &mut teller, &interrupted);
     teller.end();
     if matches!(ended, Ended::Interrupted) {
         eprintln!("interrupted; what was found so far:");
     }
     let report = scan.report(matches!(ended, Ended::Whole));
-    tell(&report, &edge.site.place, args.json)?;
+    tell(&report, &site.place, args.json)?;
     match ended {
-        Ended::Lost(Lost(why)) => Err(anyhow!("the scan ended early: {why}").into()),
+        Ended::Lost(why) => Err(anyhow!("the scan ended early: {why}").into()),
         _ if report.is_empty() => Err(anyhow!("{}", report.why_empty()).into()),
         _ => Ok(()),
     }
@@ -195,86 +195,45 @@ fn bracketed(host: &str) -> String {
 enum Ended {
     Whole,
     Interrupted,
-    Lost(Lost),
+    Lost(String),
 }
 
-/// What does the asking.
-struct Edge {
-    site: Site,
-    clock: Clock,
-    /// The link with the settings that it was opened with.
-    open: Option<(Option<Line>, GuardedLink)>,
+/// Asks whatever the scan wants to know.
+fn carry_out(reach: &mut Reach, scan: &mut Scan, teller: &mut Teller, interrupted: &AtomicBool) -> Ended {
+    while let Some(question) = scan.next_question() {
+        if interrupted.load(Ordering::Relaxed) {
+            return Ended::Interrupted;
+        }
+        let told = ask(reach, scan, question);
+        while let Some(news) = scan.next_news() {
+            teller.say(&news);
+        }
+        if let Err(why) = told {
+            return Ended::Lost(why);
+        }
+        teller.progress(&scan.progress());
+    }
+    Ended::Whole
 }
 
-impl Edge {
-    fn scan(&mut self, scan: &mut Scan, teller: &mut Teller, interrupted: &AtomicBool) -> Ended {
-        while let Some(question) = scan.next_question() {
-            if interrupted.load(Ordering::Relaxed) {
-                return Ended::Interrupted;
-            }
-            match self.ask(&question) {
-                Ok(reply) => scan.answered(&reply),
-                Err(Asking::Refused(line, why)) => scan.refuse_line(line, &why),
-                Err(Asking::Lost(lost)) => return Ended::Lost(lost),
-            }
-            while let Some(news) = scan.next_news() {
-                teller.say(&news);
-            }
-            teller.progress(&scan.progress());
+/// Tells the scan what became of its question; `Err`: it ends.
+fn ask(reach: &mut Reach, scan: &mut Scan, question: Question) -> Result<(), String> {
+    let before = reach.open_with();
+    let asked = match reach.at(question.line) {
+        Ok(link) => link.ask(&question.request, question.timeout),
+        Err(Lost(why)) => {
+            let opens_as_before = before.is_some_and(|before| reach.at(before).is_ok());
+            return scan.not_opened(&question, why, opens_as_before);
         }
-        Ended::Whole
-    }
-
-    fn ask(&mut self, question: &Question) -> Result<crate::engine::modbus::Reply, Asking> {
-        let before = self.open.as_ref().map(|(line, _)| *line);
-        if before != Some(question.line) {
-            // First, since a port is open only once.
-            self.open = None;
-            if let Err(Lost(why)) = self.open(question.line) {
-                // Where it still opens as before, it is these settings that it does not take.
-                let opens = before.is_some_and(|before| self.open(before).is_ok());
-                return Err(match question.line.filter(|_| opens) {
-                    Some(line) => Asking::Refused(line, why),
-                    None => Asking::Lost(Lost(why)),
-                });
-            }
-        }
-        let Some((_, link)) = &mut self.open else {
-            return Err(Asking::Lost(Lost("the link is not open".into())));
-        };
-        // A gateway may close a connection; the next one is as good.
-        match (link.ask(&question.request, question.timeout), &self.site.link) {
-            (Ok(reply), _) => Ok(reply),
-            (Err(_), settings::Link::Tcp { .. }) => {
-                self.open = None;
-                self.open(question.line).map_err(Asking::Lost)?;
-                let link = self.open.as_mut().map(|(_, link)| link);
-                let asked = link.map(|link| link.ask(&question.request, question.timeout));
-                asked.unwrap_or_else(|| Err(Lost("the link is not open".into()))).map_err(Asking::Lost)
-            }
-            (Err(lost), _) => Err(Asking::Lost(lost)),
+    };
+    match asked {
+        Ok(reply) => scan.answered(&reply),
+        Err(Lost(why)) => {
+            reach.close();
+            return scan.lost(question, why);
         }
     }
-
-    fn open(&mut self, line: Option<Line>) -> Result<(), Lost> {
-        let mut link = self.site.link.clone();
-        if let (
-            settings::Link::Serial { line: set, .. } | settings::Link::RtuOverTcp { line: set, .. },
-            Some(line),
-        ) = (&mut link, line)
-        {
-            *set = line;
-        }
-        let guarded = GuardedLink::new(Link::open_strict(&link)?, Guard::new(&link, None), self.clock);
-        self.open = Some((line, guarded));
-        Ok(())
-    }
-}
-
-/// Why a question has no reply.
-enum Asking {
-    Refused(Line, String),
-    Lost(Lost),
+    Ok(())
 }
 
 /// What the whole takes, beforehand.

@@ -167,6 +167,28 @@ fn a_gateway_is_asked_for_its_units_over_modbus_tcp() {
 }
 
 #[test]
+fn a_server_that_closes_its_connections_is_asked_to_the_end() {
+    for (framing, option) in [(peer::Framing::Tcp, "--tcp"), (peer::Framing::Rtu, "--rtu-over-tcp")] {
+        let peer = Peer::on_tcp(framing);
+        // Whoever is not there makes it hang up; and behind each answer it closes as well.
+        peer.misbehave(|asked, good| match asked.unit {
+            3 | 5 => vec![peer::Step::Say(good), peer::Step::HangUp],
+            _ => vec![peer::Step::HangUp],
+        });
+        let arguments = peer.arguments();
+        let output = scan(&[option, &arguments[1], "--units", "1..6", "--timeout", "3s", "--json"]);
+        assert_eq!(output.status.code(), Some(0), "{output:?}");
+        let found = found(&output);
+        assert_eq!(found["complete"], true, "{found}");
+        let units: Vec<&Value> =
+            found["found"].as_array().expect("a list").iter().map(|one| &one["unit"]).collect();
+        assert_eq!(units, [3, 5], "{found}");
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!(text.contains("the other side ends the connection when unit 1 is asked"), "{text}");
+    }
+}
+
+#[test]
 fn an_interrupt_ends_it_with_what_was_found_so_far() {
     let (_simulation, port) = simulated(Some((19200, Parity::Even)), &[(Model::MrDo4, 2)], &[]);
     let ended = interrupted(&["--serial", &path(&port), "--json"], "unit 2: METZ CONNECT");

@@ -15,9 +15,9 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use crate::engine::address::{Span, Table};
 use crate::engine::identity::{Interview, Known};
-use crate::engine::modbus::{Call, Reply, Request, RequestError};
+use crate::engine::modbus::{Call, Discarded, Reply, Request, RequestError};
 use crate::engine::settings::Line;
-use crate::engine::time::Duration;
+use crate::engine::time::{Duration, Time};
 
 pub use lines::{SPECIFIED, lines};
 pub use report::{Place, Report};
@@ -48,6 +48,8 @@ pub struct Wanted {
     pub nameless: Vec<String>,
     /// How long a unit is waited for, where somebody wants it longer than usual.
     pub timeout: Option<Duration>,
+    /// Whether there is a server behind the link that may close its connections.
+    pub of_server: bool,
 }
 
 /// One question for the line.
@@ -59,7 +61,8 @@ pub struct Question {
     pub timeout: Duration,
 }
 
-/// A scan under way: ask [`Scan::next_question`], tell [`Scan::answered`], until there is no question any more.
+/// A scan under way: ask [`Scan::next_question`], tell [`Scan::answered`], [`Scan::not_opened`] or [`Scan::lost`], until
+/// there is no question any more.
 #[derive(Debug)]
 pub struct Scan {
     wanted: Wanted,
@@ -67,6 +70,12 @@ pub struct Scan {
     /// The line on which somebody has answered.
     settled: Option<Option<Line>>,
     asked: Option<Asked>,
+    /// On the connection as it is now something has been asked, and it has outlived that.
+    has_asked_here: bool,
+    /// The question that went with a connection, which is asked once more on the next one.
+    once_more: Option<Question>,
+    /// How many questions ended the connection that was made for them.
+    hung_up: u32,
     interview: Option<(u8, Interview)>,
     /// How often the interview's question has been damaged.
     repeated: u32,
@@ -164,6 +173,9 @@ impl Scan {
             stages,
             settled: None,
             asked: None,
+            has_asked_here: false,
+            once_more: None,
+            hung_up: 0,
             interview: None,
             repeated: 0,
             again: VecDeque::new(),
@@ -184,7 +196,7 @@ impl Scan {
 
     /// What to ask next; `None`: it is over.
     pub fn next_question(&mut self) -> Option<Question> {
-        let question = self.pick()?;
+        let question = self.once_more.take().or_else(|| self.pick())?;
         self.questions += 1;
         self.unit = Some(question.request.unit);
         Some(question)
@@ -261,6 +273,7 @@ impl Scan {
 
     /// What the line did with the question.
     pub fn answered(&mut self, reply: &Reply) {
+        self.has_asked_here = true;
         let heard = &reply.discarded;
         if heard.requests_of_others.count > 0 && self.other_masters.is_none() {
             self.other_masters = Some(heard.requests_of_others.unit);
@@ -278,7 +291,7 @@ impl Scan {
                 match &reply.result {
                     _ if is_heard => self.meet(unit),
                     Err(RequestError::Unreachable(_)) => drop(self.absent.insert(unit)),
-                    Err(RequestError::Timeout) | Ok(_) => {}
+                    Err(RequestError::Timeout | RequestError::Link(_)) | Ok(_) => {}
                     Err(_) => self.look_again(unit, 0),
                 }
                 // Somebody was late, and may have been spoken over.
@@ -289,7 +302,8 @@ impl Scan {
             }
             Some(Asked::Again(unit, looks)) => match &reply.result {
                 _ if is_heard => self.meet(unit),
-                Err(RequestError::Unreachable(_) | RequestError::Timeout) | Ok(_) => {}
+                Err(RequestError::Unreachable(_) | RequestError::Timeout | RequestError::Link(_)) | Ok(_) => {
+                }
                 Err(_) if looks < LOOKS_AGAIN => self.look_again(unit, looks + 1),
                 Err(what) => self.give_up(unit, what.clone()),
             },
@@ -377,13 +391,52 @@ impl Scan {
         self.garbled.push(garbled);
     }
 
-    /// The port does not take these settings.
-    pub fn refuse_line(&mut self, line: Line, reason: &str) {
+    /// The link does not open for `question`; `opens_as_before`: it does with the settings that it had before.
+    /// `Err`: the scan cannot go on.
+    pub fn not_opened(
+        &mut self,
+        question: &Question,
+        why: String,
+        opens_as_before: bool,
+    ) -> Result<(), String> {
+        // Where it still opens as before, it is these settings that the port does not take.
+        match question.line.filter(|_| opens_as_before) {
+            Some(line) => self.refuse_line(line, &why),
+            None => return Err(why),
+        }
+        Ok(())
+    }
+
+    fn refuse_line(&mut self, line: Line, reason: &str) {
         self.stages.retain(|stage| stage.line != Some(line));
         self.again.clear();
         self.recent.clear();
         self.asked = None;
         self.news.push_back(format!("{line} is left out: {reason}"));
+    }
+
+    /// The link has ended, and `question` with it. `Err`: the scan cannot go on.
+    pub fn lost(&mut self, question: Question, why: String) -> Result<(), String> {
+        if !self.wanted.of_server {
+            return Err(why);
+        }
+        // Many servers close a connection behind each answer, or one that was idle; the next one is as good.
+        if std::mem::take(&mut self.has_asked_here) {
+            self.once_more = Some(question);
+            return Ok(());
+        }
+        // One that was made for this question: so a gateway may tell that the unit is not there.
+        if self.hung_up == 0 {
+            self.news.push_back(format!(
+                "the other side ends the connection when unit {} is asked; that counts as silence",
+                question.request.unit
+            ));
+        }
+        self.hung_up += 1;
+        let result = Err(RequestError::Link(why));
+        self.answered(&Reply::new(result, Time::default(), None, &mut Discarded::default()));
+        self.has_asked_here = false;
+        Ok(())
     }
 
     /// What is worth a line, as it happens.

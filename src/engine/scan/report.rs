@@ -153,6 +153,11 @@ impl Report {
                 "every unit answers alike, so this is one device that does not look at the unit".into(),
             );
         }
+        match self.scan.hung_up {
+            0 => {}
+            1 => notes.push("one question ended the connection; that counted as silence".into()),
+            count => notes.push(format!("{count} questions ended the connection; that counted as silence")),
+        }
         notes.extend(self.scan.garbled.iter().map(Garbled::told));
         notes
     }
@@ -169,6 +174,13 @@ impl Report {
         let rest = if self.is_whole { "" } else { ", as far as was asked" };
         if !scan.garbled.is_empty() {
             return format!("nobody answers so that it can be understood{with}{rest}");
+        }
+        if scan.hung_up > 0 && scan.quickest.is_none() {
+            return format!(
+                "none of the units {} answers{with}{rest}; the other side ends the connection when it is asked: it may be no \
+                 Modbus server, speak the other of `--tcp` and `--rtu-over-tcp`, or serve others only",
+                units(&scan.wanted.units)
+            );
         }
         let look = match (scan.noise >= NOISE_MIN, scan.wanted.lines.is_empty()) {
             (true, _) => {

@@ -4,9 +4,8 @@ use std::sync::Arc;
 
 use super::*;
 use crate::engine::device::Identify;
-use crate::engine::modbus::{Answer, Discarded, Identification, LateReply, RequestsOfOthers};
+use crate::engine::modbus::{Answer, Identification, LateReply, RequestsOfOthers};
 use crate::engine::settings::Parity;
-use crate::engine::time::Time;
 
 const EVEN: Line = SPECIFIED;
 const NONE: Line = Line { baud: 9600, parity: Parity::None, stop_bits: 1 };
@@ -45,6 +44,7 @@ fn wanted(lines: Vec<Line>, units: impl IntoIterator<Item = u8>) -> Wanted {
         known: Arc::new(vec![("acme/ra8".into(), relay)]),
         nameless: vec!["acme/mute".into()],
         timeout: None,
+        of_server: false,
     }
 }
 
@@ -286,10 +286,88 @@ fn whom_a_gateway_calls_absent_is_not_asked_again() {
 }
 
 #[test]
-fn settings_that_the_port_does_not_take_are_left_out() {
+fn settings_that_the_port_does_not_take_are_left_out_and_a_port_that_is_gone_ends_it() {
     let mut scan = Scan::new(wanted(vec![EVEN, NONE], 1..=3));
-    assert_eq!(scan.next_question().and_then(|question| question.line), Some(EVEN));
-    scan.refuse_line(EVEN, "no such speed");
-    assert_eq!(scan.next_question().and_then(|question| question.line), Some(NONE));
+    let question = scan.next_question().expect("a question");
+    assert_eq!(question.line, Some(EVEN));
+    assert_eq!(scan.not_opened(&question, "no such speed".into(), true), Ok(()));
+    let question = scan.next_question().expect("a question");
+    assert_eq!(question.line, Some(NONE));
     assert_eq!(scan.next_news().as_deref(), Some("19200 8E1 is left out: no such speed"));
+    assert_eq!(scan.not_opened(&question, "not there".into(), false), Err("not there".into()));
+    assert_eq!(scan.lost(question, "unplugged".into()), Err("unplugged".into()));
+}
+
+/// What a server does with its connection when it is asked.
+enum Manner {
+    Answers(Result),
+    AnswersAndCloses(Result),
+    Closes,
+}
+
+/// Asks units of a server; gives the scan, its news, and how often each of the units was asked for its names.
+fn run_at_server(
+    units: impl IntoIterator<Item = u8>,
+    line: Vec<Line>,
+    server: impl Fn(u8, &Call) -> Manner,
+) -> (Scan, Vec<String>, BTreeMap<u8, u32>) {
+    let mut scan = Scan::new(Wanted { of_server: true, ..wanted(line, units) });
+    let (mut is_open, mut names) = (true, BTreeMap::new());
+    for asked in 0.. {
+        let Some(question) = scan.next_question() else { break };
+        assert!(asked < 1000, "it does not end");
+        if !std::mem::replace(&mut is_open, true) {
+            scan.lost(question, "closed".into()).expect("another connection is as good");
+            continue;
+        }
+        let Request { unit, call, .. } = &question.request;
+        *names.entry(*unit).or_default() += u32::from(matches!(call, Call::ReadIdentification { .. }));
+        match server(*unit, call) {
+            Manner::Closes => scan.lost(question, "closed".into()).expect("another connection is as good"),
+            Manner::Answers(result) => scan.answered(&reply(result)),
+            Manner::AnswersAndCloses(result) => {
+                scan.answered(&reply(result));
+                is_open = false;
+            }
+        }
+    }
+    let news = std::iter::from_fn(|| scan.next_news()).collect();
+    (scan, news, names)
+}
+
+fn reply(result: Result) -> Reply {
+    let times = result.is_ok().then_some((Time::from_millis(5), Time::from_millis(9)));
+    Reply::new(result, Time(0), times, &mut Discarded::default())
+}
+
+#[test]
+fn a_server_that_closes_behind_each_answer_is_connected_to_again_for_the_same_question() {
+    for line in [vec![], vec![EVEN]] {
+        let (scan, news, names) = run_at_server(1..=4, line, |unit, call| match unit {
+            2 | 3 => Manner::AnswersAndCloses(named(call)),
+            _ => Manner::AnswersAndCloses(Err(RequestError::Timeout)),
+        });
+        assert_eq!(scan.found.keys().copied().collect::<Vec<_>>(), [2, 3]);
+        assert_eq!(names, [(1, 1), (2, 2), (3, 2), (4, 1)].into(), "the sweep, and who it is");
+        assert!(!news.iter().any(|news| news.contains("ends the connection")), "{news:?}");
+        assert!(scan.report(true).notes().is_empty());
+    }
+}
+
+#[test]
+fn a_gateway_that_hangs_up_on_who_is_not_there_is_asked_on() {
+    let (scan, news, names) = run_at_server(1..=6, vec![], |unit, call| match unit {
+        4 => Manner::Answers(named(call)),
+        _ => Manner::Closes,
+    });
+    assert_eq!(scan.found.keys().copied().collect::<Vec<_>>(), [4]);
+    assert_eq!(news[0], "the other side ends the connection when unit 1 is asked; that counts as silence");
+    assert_eq!(news.len(), 2, "told once: {news:?}");
+    // Unit 5 came behind answers on its connection, which may have been closed for any reason.
+    assert_eq!(names, [(1, 1), (2, 1), (3, 1), (4, 2), (5, 2), (6, 1)].into());
+    assert_eq!(scan.report(true).notes(), ["10 questions ended the connection; that counted as silence"]);
+
+    let (scan, ..) = run_at_server(1..=6, vec![], |_, _| Manner::Closes);
+    let why = scan.report(true).why_empty();
+    assert!(why.contains("ends the connection when it is asked: it may be no Modbus server"), "{why}");
 }
