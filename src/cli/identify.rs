@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use anyhow::anyhow;
-use serde_json::json;
 
 use super::by_hand::ByHand;
 use super::{Failure, output};
@@ -48,15 +47,17 @@ pub fn run(args: Args) -> Result<(), Failure> {
     let fitting: Vec<&str> = interview.fitting().into_iter().map(|(id, _)| id).collect();
     let matches = device.as_ref().map(|device| Match::new(device, &interview));
     match args.json {
-        true => output::print_json(&as_json(unit, &interview, &fitting, matches.as_ref()))?,
+        true => {
+            // As a program is told it over MQTT, with the profiles that fit.
+            let mut found = interview.json(("unit", unit.into()), device.as_ref());
+            found["profiles"] = fitting.into();
+            output::print_json(&found)?;
+        }
         false => output::print(&as_text(&interview, &fitting, matches.as_ref()))?,
     }
     if !interview.was_heard() {
-        let why = interview.objects_error().map_or_else(String::new, |error| {
-            let remedy = error.what_to_check().map_or_else(String::new, |remedy| format!("; {remedy}"));
-            format!(": {error}{remedy}")
-        });
-        return Err(anyhow!("unit {unit} answers nothing that fits{why}").into());
+        let why = interview.why_unheard();
+        return Err(anyhow!("unit {unit} answers nothing that fits: {why}").into());
     }
     match matches {
         Some(Match { id, found: Some(Err(reason)) }) => {
@@ -78,23 +79,6 @@ impl Match {
         let found = device.identify.as_ref().map(|identify| interview.check(identify));
         Match { id: device.profile.clone(), found }
     }
-}
-
-/// As a program is told it over MQTT, with the profiles that fit.
-fn as_json(unit: u8, interview: &Interview, fitting: &[&str], matches: Option<&Match>) -> serde_json::Value {
-    let profile = matches.map(|Match { id, found }| match found {
-        None => json!({"id": id, "matches": null, "reason": "it goes by nothing"}),
-        Some(Ok(found)) => json!({"id": id, "matches": true, "found": found}),
-        Some(Err(reason)) => json!({"id": id, "matches": false, "reason": reason}),
-    });
-    json!({
-        "unit": unit,
-        "objects": interview.objects_json(),
-        "objects_error": interview.objects_error().map(|error| error.to_string()),
-        "server_id": interview.server_id_json(),
-        "profiles": fitting,
-        "profile": profile,
-    })
 }
 
 fn as_text(interview: &Interview, fitting: &[&str], matches: Option<&Match>) -> String {

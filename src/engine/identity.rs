@@ -1,9 +1,10 @@
-//! Whether the device that answers is the one that the profile describes.
+//! Who a device is: whether the one that answers is the one that the profile describes, who a stranger is, and how that
+//! one would stand in the configuration.
 
 mod interview;
 mod proposal;
 
-pub use interview::{Interview, Known, known, nameless};
+pub use interview::{ANY_REGISTER, Interview, Known, known, nameless};
 pub use proposal::{entry, name_for};
 
 use crate::engine::device::Identify;

@@ -33,12 +33,9 @@ pub struct LineChange {
 /// The profile that the device is sure to have, by its own word. `given` is the one that a person names.
 pub fn profile_of<'a>(interview: &'a Interview, given: Option<&'a Device>) -> Result<&'a str, Refusal> {
     if !interview.was_heard() {
-        let why = interview.objects_error().map_or_else(String::new, |error| {
-            let check = error.what_to_check().map_or_else(String::new, |check| format!("; {check}"));
-            format!(": {error}{check}")
-        });
         return Err(Refusal::Device(format!(
-            "it does not answer with these settings{why}; `busker scan --serial PORT --units UNIT` finds those that it has"
+            "it does not answer with these settings: {}; `busker scan --serial PORT --units UNIT` finds those that it has",
+            interview.why_unheard()
         )));
     }
     let fitting = interview.fitting();
@@ -220,8 +217,7 @@ impl Verification {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::address::{Span, Table};
-    use crate::engine::identity::Known;
+    use crate::engine::identity::{ANY_REGISTER, Known};
     use crate::engine::modbus::Identification;
     use crate::engine::profile::Library;
 
@@ -423,7 +419,7 @@ mod tests {
 
     #[test]
     fn a_device_that_tells_nobody_who_it_is_is_asked_what_it_has_answered_before() {
-        let any_register = Call::Read(Span::single(Table::Holding, 0));
+        let any_register = Call::Read(ANY_REGISTER);
         let silent_to_what_it_does_not_know = |call: &Call| match call {
             Call::Read(_) => Err(RequestError::Exception(2)),
             _ => Err(RequestError::Timeout),

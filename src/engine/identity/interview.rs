@@ -9,7 +9,7 @@ use std::sync::Arc;
 use serde_json::{Map, Value as Json, json};
 
 use crate::engine::address::{Span, Table};
-use crate::engine::device::Identify;
+use crate::engine::device::{Device, Identify};
 use crate::engine::modbus::names::{hexadecimal, object_name};
 use crate::engine::modbus::{self, Answer, Call, RequestError};
 use crate::engine::profile::Library;
@@ -35,7 +35,7 @@ pub fn nameless(library: &Library) -> Vec<String> {
 const REGISTERS_MAX: usize = 4;
 /// Read of a device that has answered nothing else: whoever it is says something to that, if only that it
 /// has no such register.
-const ANY_REGISTER: Span = Span::single(Table::Holding, 0);
+pub const ANY_REGISTER: Span = Span::single(Table::Holding, 0);
 
 /// One device that is asked who it is. Ask [`Interview::question`], tell [`Interview::answered`], until
 /// there is no question any more.
@@ -151,8 +151,8 @@ impl Interview {
                 }
                 let is_enough = match self.whom {
                     Whom::DeviceOf(_) => false,
-                    Whom::Stranger => self.fitting().len() == 1,
-                    Whom::StrangerInBrief => !is_heard || self.fitting().len() == 1,
+                    Whom::Stranger => self.only_fitting().is_some(),
+                    Whom::StrangerInBrief => !is_heard || self.only_fitting().is_some(),
                 };
                 if is_enough {
                     self.registers.clear();
@@ -232,6 +232,13 @@ impl Interview {
         self.server_id.as_ref()
     }
 
+    /// Why nothing was heard, and where to look.
+    pub fn why_unheard(&self) -> String {
+        let error = self.objects_error.as_ref().unwrap_or(&RequestError::Timeout);
+        let remedy = error.what_to_check().map_or_else(String::new, |remedy| format!("; {remedy}"));
+        format!("{error}{remedy}")
+    }
+
     /// The objects by their names, as programs are told them.
     pub fn objects_json(&self) -> Map<String, Json> {
         self.objects.iter().map(|(number, text)| (object_name(*number), text.clone().into())).collect()
@@ -244,6 +251,25 @@ impl Interview {
             Some(Err(error)) => json!({"error": error.to_string()}),
             None => Json::Null,
         }
+    }
+
+    /// What `whom` has said, and whether it is the one that `device` describes, as programs are told it.
+    pub fn json(&self, whom: (&str, Json), device: Option<&Device>) -> Json {
+        let profile = device.map(|device| {
+            let id = &device.profile;
+            match device.identify.as_ref().map(|identify| self.check(identify)) {
+                None => json!({"id": id, "matches": null, "reason": "it goes by nothing"}),
+                Some(Ok(found)) => json!({"id": id, "matches": true, "found": found}),
+                Some(Err(reason)) => json!({"id": id, "matches": false, "reason": reason}),
+            }
+        });
+        json!({
+            whom.0: whom.1,
+            "objects": self.objects_json(),
+            "objects_error": self.objects_error.as_ref().map(RequestError::to_string),
+            "server_id": self.server_id_json(),
+            "profile": profile,
+        })
     }
 
     /// What the device calls itself: its names, one behind the other.
@@ -276,6 +302,12 @@ impl Interview {
     pub fn fitting(&self) -> Vec<(&str, String)> {
         let told = |entry: &'_ (String, Identify)| self.check(&entry.1).ok();
         self.known.iter().filter_map(|entry| Some((entry.0.as_str(), told(entry)?))).collect()
+    }
+
+    /// The one that fits, where no other does.
+    pub fn only_fitting(&self) -> Option<(&str, String)> {
+        let mut fitting = self.fitting();
+        fitting.pop().filter(|_| fitting.is_empty())
     }
 }
 

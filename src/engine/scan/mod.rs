@@ -13,8 +13,7 @@ mod report;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use crate::engine::address::{Span, Table};
-use crate::engine::identity::{Interview, Known};
+use crate::engine::identity::{ANY_REGISTER, Interview, Known};
 use crate::engine::modbus::{Call, Discarded, Reply, Request, RequestError};
 use crate::engine::settings::Line;
 use crate::engine::time::{Duration, Time};
@@ -488,7 +487,7 @@ impl How {
     fn call(self) -> Call {
         match self {
             How::Names => Call::ReadIdentification { code: 1, object: 0 },
-            How::Register => Call::Read(Span::single(Table::Holding, 0)),
+            How::Register => Call::Read(ANY_REGISTER),
         }
     }
 }

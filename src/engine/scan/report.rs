@@ -205,10 +205,7 @@ impl Found {
     }
 
     fn only_profile(&self) -> Option<&str> {
-        match self.profiles()[..] {
-            [only] => Some(only),
-            _ => None,
-        }
+        self.interview.only_fitting().map(|(id, _)| id)
     }
 
     /// `METZ CONNECT GmbH MR-DO4 V1.4`, and what is to be said of its answers. On one line, whatever it says.

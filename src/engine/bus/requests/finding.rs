@@ -33,26 +33,11 @@ impl Identification {
 
     fn ended(&self, device: &DeviceState) -> Progress {
         let Identification(interview) = self;
-        let device_profile = device.device();
-        let id = &device_profile.profile;
-        let checked = device_profile.identify.as_ref().map(|identify| interview.check(identify));
-        let profile = match checked {
-            None => json!({"id": id, "matches": null, "reason": "it goes by nothing"}),
-            Some(Ok(found)) => json!({"id": id, "matches": true, "found": found}),
-            Some(Err(reason)) => json!({"id": id, "matches": false, "reason": reason}),
-        };
-        let error = interview.objects_error().map(RequestError::to_string);
-        let data = json!({
-            "device": device.name(),
-            "objects": interview.objects_json(),
-            "objects_error": error,
-            "server_id": interview.server_id_json(),
-            "profile": profile,
-        });
+        let data = interview.json(("device", device.name().into()), Some(device.device()));
         if interview.was_heard() {
             return Progress::done(data);
         }
-        let error = error.unwrap_or_else(|| RequestError::Timeout.to_string());
+        let error = interview.objects_error().unwrap_or(&RequestError::Timeout).to_string();
         Progress::Done { status: Status::Error, data, error: Some(error) }
     }
 }

@@ -1,5 +1,6 @@
 //! A scan: which units answer on a bus, who they are, and how they would stand in the configuration.
-//! One cheap question for each unit, with pauses, so that the polls go on.
+//! One cheap question for each unit, a few more for one that answers without its names, with pauses, so that the polls
+//! go on.
 
 use serde_json::{Value as Json, json};
 
@@ -118,19 +119,17 @@ impl Bus {
         if scanning.interview.was_heard() {
             let unit = scanning.unit;
             let bus = &self.name;
-            let fitting = scanning.interview.fitting();
-            let only = match &fitting[..] {
-                [only] => Some(only),
-                _ => None,
-            };
-            let proposal = only
-                .map(|(profile, _)| format!("{}: {}", name_for(profile, unit), entry(profile, bus, unit)));
-            let identity = only.map(|(_, told)| told.clone()).or_else(|| scanning.interview.names());
+            let only = scanning.interview.only_fitting();
+            let profile = only.as_ref().map(|(profile, _)| *profile);
+            let proposal =
+                profile.map(|profile| format!("{}: {}", name_for(profile, unit), entry(profile, bus, unit)));
+            let told = only.as_ref().map(|(_, told)| told.clone());
+            let identity = told.or_else(|| scanning.interview.names());
             scanning.found.push(json!({
                 "unit": unit,
                 "device": null,
                 "identity": identity,
-                "profile": only.map(|(profile, _)| *profile),
+                "profile": profile,
                 "configuration": proposal,
             }));
         }
