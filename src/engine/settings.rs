@@ -2,6 +2,7 @@
 //! `configuration::file`.
 
 mod mqtt;
+mod units;
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -13,6 +14,7 @@ use crate::engine::time::Duration;
 use crate::engine::units::Release;
 
 pub use self::mqtt::{ClientCertificate, Layout, Level, Manner, Mqtt, Tls};
+pub use self::units::{UNIT_OF_LINE_MAX, units};
 
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
@@ -169,16 +171,30 @@ impl Link {
             Link::Tcp { .. } => None,
         }
     }
+
+    /// Where it is: `/dev/ttyUSB0`, `192.168.1.20:502`, `[::1]:502`.
+    pub fn address(&self) -> String {
+        match self {
+            Link::Serial { path, .. } => path.clone(),
+            Link::Tcp { host, port } | Link::RtuOverTcp { host, port, .. } => host_and_port(host, *port),
+        }
+    }
+}
+
+/// `192.168.1.20:502`; an address of version 6 stands in brackets.
+pub fn host_and_port(host: &str, port: u16) -> String {
+    if host.contains(':') { format!("[{host}]:{port}") } else { format!("{host}:{port}") }
 }
 
 impl fmt::Display for Link {
     /// `serial /dev/ttyUSB0`, `tcp 192.168.1.20:502`, `rtu over tcp 192.168.1.21:4196`
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Link::Serial { path, .. } => write!(f, "serial {path}"),
-            Link::Tcp { host, port } => write!(f, "tcp {host}:{port}"),
-            Link::RtuOverTcp { host, port, .. } => write!(f, "rtu over tcp {host}:{port}"),
-        }
+        let kind = match self {
+            Link::Serial { .. } => "serial",
+            Link::Tcp { .. } => "tcp",
+            Link::RtuOverTcp { .. } => "rtu over tcp",
+        };
+        write!(f, "{kind} {}", self.address())
     }
 }
 
@@ -241,6 +257,17 @@ pub enum Parity {
     None,
     Even,
     Odd,
+}
+
+impl fmt::Display for Parity {
+    /// As people write it: `even`
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Parity::None => "none",
+            Parity::Even => "even",
+            Parity::Odd => "odd",
+        })
+    }
 }
 
 /// Who switches an RS485 transceiver between sending and listening.
@@ -313,4 +340,22 @@ pub struct Wanted {
     pub value: String,
     /// Whether it is written again when the device holds something else later.
     pub enforce: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_link_is_told_with_an_address_that_can_be_typed() {
+        let line = Line { baud: 9600, parity: Parity::None, stop_bits: 1 };
+        for (link, told) in [
+            (Link::Serial { path: "/dev/ttyUSB0".into(), line, rs485: Rs485::Auto }, "serial /dev/ttyUSB0"),
+            (Link::Tcp { host: "plc.local".into(), port: 502 }, "tcp plc.local:502"),
+            (Link::Tcp { host: "fe80::1%eth0".into(), port: 502 }, "tcp [fe80::1%eth0]:502"),
+            (Link::RtuOverTcp { host: "::1".into(), port: 4196, line }, "rtu over tcp [::1]:4196"),
+        ] {
+            assert_eq!(link.to_string(), told);
+        }
+    }
 }

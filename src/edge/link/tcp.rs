@@ -3,13 +3,16 @@
 use std::net::{TcpStream, ToSocketAddrs};
 
 use crate::edge::link::Lost;
+use crate::engine::settings;
 use crate::engine::time::Duration;
 
 /// How long each address of a host is tried.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
 
 pub fn connect(host: &str, port: u16) -> Result<TcpStream, Lost> {
-    let lost = |error: std::io::Error| Lost(format!("`{host}:{port}` cannot be reached: {error}"));
+    let lost = |error: std::io::Error| {
+        Lost(format!("`{}` cannot be reached: {error}", settings::host_and_port(host, port)))
+    };
     let mut failure = Lost(format!("`{host}` has no address"));
     for address in (host, port).to_socket_addrs().map_err(lost)? {
         match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {

@@ -102,7 +102,7 @@ impl Broker {
             connection: connection.clone(),
             mqtt: settings.mqtt.clone(),
             ends: Ends {
-                address: format!("{}:{}", settings.mqtt.host, settings.mqtt.port),
+                address: settings.mqtt.address(),
                 client_id,
                 base_topic: settings.mqtt.base_topic.clone(),
                 websocket: settings.mqtt.websocket.is_some(),
@@ -170,8 +170,7 @@ fn options(mqtt: &Mqtt, topics: &Topics, secrets: Secrets) -> MqttOptions {
         // The library wants a whole URL.
         Some(path) => {
             let scheme = if mqtt.tls.is_some() { "wss" } else { "ws" };
-            let host = if mqtt.host.contains(':') { format!("[{}]", mqtt.host) } else { mqtt.host.clone() };
-            format!("{scheme}://{host}:{}{path}", mqtt.port)
+            format!("{scheme}://{}{path}", mqtt.address())
         }
     };
     let mut options = MqttOptions::new(client, address, mqtt.port);

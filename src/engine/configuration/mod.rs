@@ -24,7 +24,8 @@ use crate::engine::device::{self, Device};
 use crate::engine::profile::file::Intervals;
 use crate::engine::profile::{self, Inline, Library};
 use crate::engine::settings::{
-    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Level, Password, Recorder, Settings, Wanted,
+    Bus, DeviceSettings, Eeprom, HomeAssistant, Http, Level, Password, Recorder, Settings, UNIT_OF_LINE_MAX,
+    Wanted, host_and_port,
 };
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
@@ -205,10 +206,8 @@ impl Resolver<'_> {
     fn http(&mut self, file: &file::Http) -> Http {
         let (token, token_file) = (file.token.as_ref(), file.token_file.as_ref());
         self.one_of_two("token", token.map(|at| &at.place), token_file.map(|at| &at.place));
-        let listen = file.listen.as_ref().map(|Listen(listen)| match listen.host.contains(':') {
-            true => format!("[{}]:{}", listen.host, listen.port),
-            false => format!("{}:{}", listen.host, listen.port),
-        });
+        let listen = file.listen.as_ref();
+        let listen = listen.map(|Listen(listen)| host_and_port(&listen.host, listen.port));
         let token = match (token, token_file) {
             (Some(token), _) => Password::Given(token.0.clone()),
             (None, Some(path)) => Password::File(PathBuf::from(&path.value)),
@@ -352,7 +351,7 @@ impl Resolver<'_> {
         }
         let index = buses.iter().position(|(name, _)| name.value == wanted.value)?;
         let unit = device.unit.get()?;
-        if buses.entries[index].1.tcp.is_none() && !(1..=247).contains(&unit.value.0) {
+        if buses.entries[index].1.tcp.is_none() && !(1..=UNIT_OF_LINE_MAX).contains(&unit.value.0) {
             let why =
                 if unit.value.0 == 0 { "0 speaks to all units at once" } else { "248 to 255 are reserved" };
             self.faults.add(

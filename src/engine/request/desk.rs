@@ -2,6 +2,7 @@
 //! right.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 use std::sync::{Arc, Weak};
 
 use serde_json::Value as Json;
@@ -12,7 +13,7 @@ use crate::engine::arrivals::{Command, Errand};
 use crate::engine::command::{self, Outcome, OutcomeKind};
 use crate::engine::identity::{self, Known};
 use crate::engine::profile::Library;
-use crate::engine::settings::{Link, Settings};
+use crate::engine::settings::{Settings, UNIT_OF_LINE_MAX, units};
 use crate::engine::time::{Date, Duration};
 use crate::engine::topics::{Message, Topics};
 use crate::engine::yaml::{Scalar, list_of_choices};
@@ -46,8 +47,8 @@ pub struct Desk {
     topics: Topics,
     /// Device to bus.
     bus_of: BTreeMap<String, usize>,
-    /// Names in their order, and whether the bus is Modbus TCP.
-    buses: Vec<(String, bool)>,
+    /// Names in their order, and the highest unit of each.
+    buses: Vec<(String, u8)>,
     library: Library,
     /// The identifications in the library, once somebody has wanted them.
     known: Option<Known>,
@@ -60,7 +61,7 @@ pub struct Desk {
 impl Desk {
     pub fn new(settings: &Settings, library: Library) -> Desk {
         let bus_of = settings.devices.iter().map(|device| (device.name.clone(), device.bus));
-        let buses = settings.buses.iter().map(|bus| (bus.name.clone(), matches!(bus.link, Link::Tcp { .. })));
+        let buses = settings.buses.iter().map(|bus| (bus.name.clone(), bus.link.units_most()));
         Desk {
             topics: Topics::of(&settings.mqtt),
             bus_of: bus_of.collect(),
@@ -236,13 +237,8 @@ impl Desk {
 
     /// `1..20` or `7`; without it all units of a line.
     fn units(&self, bus: usize, text: Option<&str>) -> Result<(u8, u8), String> {
-        let most = if self.buses[bus].1 { 255 } else { 247 };
-        let Some(text) = text else { return Ok((1, 247)) };
-        let (first, last) = text.split_once("..").unwrap_or((text, text));
-        match (first.trim().parse::<u8>(), last.trim().parse::<u8>()) {
-            (Ok(first), Ok(last)) if 1 <= first && first <= last && last <= most => Ok((first, last)),
-            _ => Err(format!("`{text}` names no units of this bus; expected them as in `1..{most}` or `7`")),
-        }
+        let Some(text) = text else { return Ok((1, UNIT_OF_LINE_MAX)) };
+        units(text, self.buses[bus].1).map(RangeInclusive::into_inner)
     }
 
     fn known(&mut self) -> Known {

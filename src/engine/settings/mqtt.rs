@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use super::Password;
+use super::{Password, host_and_port};
 use crate::engine::time::Duration;
 
 #[derive(Clone, PartialEq, Eq)]
@@ -49,6 +49,11 @@ impl Default for Mqtt {
 }
 
 impl Mqtt {
+    /// Where the broker is: `localhost:1883`.
+    pub fn address(&self) -> String {
+        host_and_port(&self.host, self.port)
+    }
+
     /// Whether the same connection serves both, whatever is told on it and in which way.
     pub fn is_reached_as(&self, other: &Mqtt) -> bool {
         let Mqtt { topics, values, json, .. } = other.clone();
@@ -59,7 +64,7 @@ impl Mqtt {
 impl fmt::Debug for Mqtt {
     /// Tells everything but the password.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Mqtt({}:{}, base topic {})", self.host, self.port, self.base_topic)
+        write!(f, "Mqtt({}, base topic {})", self.address(), self.base_topic)
     }
 }
 
