@@ -93,21 +93,12 @@ impl ByHand {
     /// Opens the line.
     pub fn open(&self) -> Result<Asked, Failure> {
         let line = self.characters.line();
-        let link = match (&self.line.serial, &self.line.tcp, &self.line.rtu_over_tcp) {
-            (Some(path), ..) => settings::Link::Serial { path: path.clone(), line, rs485: Rs485::Auto },
-            (_, Some(address), _) => {
-                let (host, port) = host_and_port(address)?;
-                settings::Link::Tcp { host, port }
-            }
-            (.., Some(address)) => {
-                let (host, port) = host_and_port(address)?;
-                settings::Link::RtuOverTcp { host, port, line }
-            }
-            _ => return self.open_configured(),
-        };
+        let WhichLine { serial, tcp, rtu_over_tcp, .. } = &self.line;
+        let Some(link) = link([serial, tcp, rtu_over_tcp], line)? else { return self.open_configured() };
         let unit = self.unit.unwrap_or_default();
-        if !matches!(link, settings::Link::Tcp { .. }) && unit > 247 {
-            return Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")));
+        let most = link.units_most();
+        if unit > most {
+            return Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to {most}")));
         }
         let device = self.profile.as_deref().map(profiles::load).transpose()?;
         open(&link, None, Addressee { unit, timeout: self.timeout, device })
@@ -145,7 +136,26 @@ fn open(link: &settings::Link, gap: Option<Duration>, whom: Addressee) -> Result
     Ok(Asked { link, broadcasts, whom })
 }
 
-pub fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
+/// The link that is named by `--serial`, `--tcp` or `--rtu-over-tcp`, in this order; `None`: none is.
+pub fn link(
+    [serial, tcp, rtu_over_tcp]: [&Option<String>; 3],
+    line: Line,
+) -> Result<Option<settings::Link>, Failure> {
+    Ok(Some(match (serial, tcp, rtu_over_tcp) {
+        (Some(path), ..) => settings::Link::Serial { path: path.clone(), line, rs485: Rs485::Auto },
+        (_, Some(address), _) => {
+            let (host, port) = host_and_port(address)?;
+            settings::Link::Tcp { host, port }
+        }
+        (.., Some(address)) => {
+            let (host, port) = host_and_port(address)?;
+            settings::Link::RtuOverTcp { host, port, line }
+        }
+        _ => return Ok(None),
+    }))
+}
+
+fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
     match address.rsplit_once(':') {
         Some((host, port)) if !host.is_empty() && (!host.contains(':') || host.ends_with(']')) => {
             let number =

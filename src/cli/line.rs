@@ -101,23 +101,10 @@ impl Args {
         match refusal {
             Refusal::Device(reason) => {
                 let unit = self.unit;
-                anyhow!(
-                    "unit {unit} at {} {}: {reason}; nothing was written",
-                    self.baud,
-                    parity_name(self.parity)
-                )
-                .into()
+                anyhow!("unit {unit} at {} {}: {reason}; nothing was written", self.baud, self.parity).into()
             }
             Refusal::Wish(reason) => Failure::wrong(format!("{reason}; nothing was written")),
         }
-    }
-}
-
-fn parity_name(parity: Parity) -> &'static str {
-    match parity {
-        Parity::Even => "even",
-        Parity::Odd => "odd",
-        Parity::None => "none",
     }
 }
 
@@ -186,7 +173,7 @@ impl Edge<'_> {
                     "the other devices of its line keep theirs; when all have {to}, the bus in the configuration wants \
                      `baud: {}` and `parity: {}`",
                     to.baud,
-                    parity_name(to.parity)
+                    to.parity
                 );
                 Ok(())
             }

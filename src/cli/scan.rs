@@ -1,5 +1,6 @@
 //! `busker scan`: who answers on a line, and how that would stand in the configuration.
 
+use std::collections::BTreeSet;
 use std::io::{IsTerminal, Write};
 use std::path::Path;
 use std::sync::Arc;
@@ -7,15 +8,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::anyhow;
 
-use super::by_hand::{Reach, host_and_port};
+use super::by_hand::{self, Reach};
 use super::{Failure, output};
 use crate::edge::clock::Clock;
 use crate::edge::link::{Lost, adapter};
 use crate::edge::shutdown::{Heard, Signals};
 use crate::engine::identity;
 use crate::engine::profile::Library;
-use crate::engine::scan::{self, Place, Progress, Question, Report, Scan, Wanted};
-use crate::engine::settings::{self, Line, Parity, Rs485};
+use crate::engine::scan::{self, Progress, Question, Report, Scan, Wanted};
+use crate::engine::settings::{self, Line, Link, Parity, UNIT_OF_LINE_MAX};
 use crate::engine::time::{Duration, Time};
 use crate::engine::yaml::Scalar;
 
@@ -34,8 +35,8 @@ pub struct Args {
     #[command(flatten)]
     line: WhichLine,
     /// The units to ask: `1..32`, `7`, or several of them with commas [default: 1..247, and 255 on Modbus TCP]
-    #[arg(long, value_name = "UNITS", value_parser = units)]
-    units: Option<Units>,
+    #[arg(long, value_name = "UNITS")]
+    units: Option<String>,
     /// The line's bit rate, where it is known
     #[arg(long, value_name = "RATE", value_parser = clap::value_parser!(u32).range(300..=1_000_000), conflicts_with = "tcp")]
     baud: Option<u32>,
@@ -68,44 +69,26 @@ struct WhichLine {
     rtu_over_tcp: Option<String>,
 }
 
-#[derive(Clone, Debug)]
-struct Units(Vec<u8>);
-
-/// Reads `1..32,40`.
-fn units(text: &str) -> Result<Units, String> {
-    let mut units = Vec::new();
-    for part in text.split(',') {
-        let (first, last) = part.split_once("..").unwrap_or((part, part));
-        match (first.trim().parse::<u8>(), last.trim().parse::<u8>()) {
-            (Ok(first), Ok(last)) if 1 <= first && first <= last => units.extend(first..=last),
-            _ => return Err(format!("`{part}` names no units; expected them as in `1..32` or `7`")),
-        }
-    }
-    units.sort_unstable();
-    units.dedup();
-    Ok(Units(units))
-}
-
 pub fn run(args: Args) -> Result<(), Failure> {
     let library = Library::shipped();
-    let site = args.site()?;
+    let link = args.link()?;
     let wanted = Wanted {
-        lines: args.lines(),
-        units: args.units()?,
+        lines: args.lines(&link),
+        units: args.units(&link)?,
         known: identity::known(&library),
         nameless: identity::nameless(&library),
         timeout: args.timeout,
-        of_server: args.line.serial.is_none(),
+        of_server: !matches!(link, Link::Serial { .. }),
     };
     let interrupted = interrupted()?;
     let mut scan = Scan::new(wanted);
     let clock = Clock::start();
-    let mut reach = Reach::new(site.link, clock);
+    let mut reach = Reach::new(link.clone(), clock);
     // What cannot be opened at all is told before anything is promised.
     if let Err(Lost(why)) = reach.at(scan.progress().line) {
         return Err(anyhow!("{why}").into());
     }
-    eprintln!("{}", promise(&scan, &site.shown));
+    eprintln!("{}", promise(&scan, &link.address()));
     let mut teller = Teller::new(clock);
     let ended = carry_out(&mut reach, &mut scan, &mut teller, &interrupted);
     teller.end();
@@ -113,7 +96,7 @@ pub fn run(args: Args) -> Result<(), Failure> {
         eprintln!("interrupted; what was found so far:");
     }
     let report = scan.report(matches!(ended, Ended::Whole));
-    tell(&report, &site.place, args.json)?;
+    tell(&report, &lasting(link), args.json)?;
     match ended {
         Ended::Lost(why) => Err(anyhow!("the scan ended early: {why}").into()),
         _ if report.is_empty() => Err(anyhow!("{}", report.why_empty()).into()),
@@ -121,74 +104,54 @@ pub fn run(args: Args) -> Result<(), Failure> {
     }
 }
 
-fn tell(report: &Report, place: &Place, as_json: bool) -> Result<(), Failure> {
+fn tell(report: &Report, link: &Link, as_json: bool) -> Result<(), Failure> {
     if as_json {
-        return output::print_json(&report.json(place));
+        return output::print_json(&report.json(link));
     }
     report.notes().iter().for_each(|note| eprintln!("note: {note}"));
-    report.configuration(place).map_or(Ok(()), |text| output::print(&text))
+    report.configuration(link).map_or(Ok(()), |text| output::print(&text))
 }
 
-/// What is scanned.
-struct Site {
-    place: Place,
-    link: settings::Link,
-    shown: String,
+/// By the name that stays with the adapter.
+fn lasting(mut link: Link) -> Link {
+    if let Link::Serial { path, .. } = &mut link {
+        if let Some(stable) = adapter::stable_path(Path::new(&*path), Path::new(adapter::BY_ID)) {
+            *path = stable.display().to_string();
+        }
+    }
+    link
 }
 
 impl Args {
-    fn site(&self) -> Result<Site, Failure> {
-        let line = self.lines().first().copied().unwrap_or(scan::SPECIFIED);
-        let (place, link, shown) = match (&self.line.serial, &self.line.tcp, &self.line.rtu_over_tcp) {
-            (Some(path), ..) => {
-                // The name that stays with the adapter.
-                let stable = adapter::stable_path(Path::new(path), Path::new(adapter::BY_ID));
-                let lasting = stable.map_or_else(|| path.clone(), |path| path.display().to_string());
-                let link = settings::Link::Serial { path: path.clone(), line, rs485: Rs485::Auto };
-                (Place::Serial(lasting), link, path.clone())
-            }
-            (_, Some(address), _) => {
-                let (host, port) = host_and_port(address)?;
-                let address = format!("{}:{port}", bracketed(&host));
-                (Place::Tcp(address.clone()), settings::Link::Tcp { host, port }, address)
-            }
-            (.., address) => {
-                let (host, port) = host_and_port(address.as_deref().unwrap_or_default())?;
-                let address = format!("{}:{port}", bracketed(&host));
-                let link = settings::Link::RtuOverTcp { host, port, line };
-                (Place::RtuOverTcp(address.clone()), link, address)
-            }
-        };
-        Ok(Site { place, link, shown })
+    /// What is scanned, with any settings: it is opened with those of each question.
+    fn link(&self) -> Result<Link, Failure> {
+        let WhichLine { serial, tcp, rtu_over_tcp } = &self.line;
+        let link = by_hand::link([serial, tcp, rtu_over_tcp], scan::SPECIFIED)?;
+        link.ok_or_else(|| Failure::wrong("expected `--serial`, `--tcp` or `--rtu-over-tcp`"))
     }
 
     /// The settings to try: behind a server only its own, which nobody here can change.
-    fn lines(&self) -> Vec<Line> {
+    fn lines(&self, link: &Link) -> Vec<Line> {
         let lines = scan::lines(self.baud, self.parity, self.stop_bits);
-        match (&self.line.serial, &self.line.rtu_over_tcp) {
-            (Some(_), _) => lines,
-            (_, Some(_)) => lines.into_iter().take(1).collect(),
-            _ => Vec::new(),
+        match link {
+            Link::Serial { .. } => lines,
+            Link::RtuOverTcp { .. } => lines.into_iter().take(1).collect(),
+            Link::Tcp { .. } => Vec::new(),
         }
     }
 
-    fn units(&self) -> Result<Vec<u8>, Failure> {
-        let of_tcp = self.line.tcp.is_some();
-        match &self.units {
-            None => Ok((1..=247).chain(of_tcp.then_some(255)).collect()),
-            Some(Units(units)) => match units.iter().find(|unit| **unit > 247 && !of_tcp) {
-                Some(unit) => {
-                    Err(Failure::wrong(format!("there is no unit {unit} on a line; expected 1 to 247")))
-                }
-                None => Ok(units.clone()),
-            },
+    fn units(&self, link: &Link) -> Result<Vec<u8>, Failure> {
+        let most = link.units_most();
+        let Some(text) = &self.units else {
+            // Of the units that only Modbus TCP has, 255 is a gateway itself.
+            return Ok((1..=UNIT_OF_LINE_MAX).chain((most > UNIT_OF_LINE_MAX).then_some(most)).collect());
+        };
+        let mut units = BTreeSet::new();
+        for part in text.split(',') {
+            units.extend(settings::units(part.trim(), most).map_err(Failure::wrong)?);
         }
+        Ok(units.into_iter().collect())
     }
-}
-
-/// An address of version 6 in brackets, as it stands before a port.
-fn bracketed(host: &str) -> String {
-    if host.contains(':') { format!("[{host}]") } else { host.into() }
 }
 
 /// How it ended.
@@ -337,15 +300,34 @@ impl Teller {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+
     use super::*;
+    use crate::engine::settings::Rs485;
+
+    #[derive(clap::Parser)]
+    struct Typed {
+        #[command(flatten)]
+        args: Args,
+    }
 
     #[test]
     fn units_are_spans_and_single_ones() {
-        let read = |text: &str| units(text).map(|Units(units)| units);
-        assert_eq!(read("7"), Ok(vec![7]));
-        assert_eq!(read("30..32, 1..2,31"), Ok(vec![1, 2, 30, 31, 32]));
-        for wrong in ["", "0", "5..3", "1..300", "all"] {
-            assert!(read(wrong).is_err(), "{wrong}");
+        let link = Link::Serial { path: "line".into(), line: scan::SPECIFIED, rs485: Rs485::Auto };
+        let server = Link::Tcp { host: "plc".into(), port: 502 };
+        let check = |link: &Link, text: Option<&str>, expected: Option<Vec<u8>>| {
+            let mut words = vec!["scan", "--serial", "line"];
+            words.extend(text.iter().flat_map(|text| ["--units", text]));
+            let args = Typed::parse_from(words).args;
+            assert_eq!(args.units(link).ok(), expected, "{text:?}");
+        };
+        check(&link, Some("7"), Some(vec![7]));
+        check(&link, Some("30..32, 1..2,31"), Some(vec![1, 2, 30, 31, 32]));
+        check(&server, Some("246..248"), Some(vec![246, 247, 248]));
+        check(&link, None, Some((1..=247).collect()));
+        check(&server, None, Some((1..=247).chain([255]).collect()));
+        for wrong in ["", "0", "5..3", "246..248", "1..300", "all", "1,,2"] {
+            check(&link, Some(wrong), None);
         }
     }
 

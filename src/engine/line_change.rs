@@ -150,12 +150,12 @@ fn word(register: &SettingsRegister, to: Line) -> Result<u16, String> {
         let known: Vec<String> = register.baud.iter().map(|(baud, _)| baud.to_string()).collect();
         return Err(format!("has no {} baud; expected {}", to.baud, known.join(", ")));
     };
-    let (parity, name) = match to.parity {
-        Parity::Even => (register.even, "even"),
-        Parity::Odd => (register.odd, "odd"),
-        Parity::None => (register.none, "none"),
+    let parity = match to.parity {
+        Parity::Even => register.even,
+        Parity::Odd => register.odd,
+        Parity::None => register.none,
     };
-    let parity = parity.ok_or_else(|| format!("cannot have the parity `{name}`"))?;
+    let parity = parity.ok_or_else(|| format!("cannot have the parity `{}`", to.parity))?;
     Ok(register.add | baud | parity)
 }
 

@@ -19,7 +19,7 @@ use crate::engine::settings::Line;
 use crate::engine::time::{Duration, Time};
 
 pub use lines::{SPECIFIED, lines};
-pub use report::{Place, Report};
+pub use report::Report;
 
 /// Units up to this are asked at all settings before others are.
 const LIKELY_UNITS: u8 = 32;

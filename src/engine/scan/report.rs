@@ -6,7 +6,7 @@ use serde_json::{Value as Json, json};
 
 use crate::engine::identity::{Interview, name_for};
 use crate::engine::modbus::RequestError;
-use crate::engine::settings::{Line, Parity};
+use crate::engine::settings::{Line, Link};
 
 use super::{Found, Garbled, Scan};
 
@@ -16,14 +16,6 @@ pub(super) const OTHER_MASTER: &str =
 const NOISE_MIN: u32 = 20;
 /// Fewer units that all say the same may well be so many devices.
 const MANY_UNITS: usize = 32;
-
-/// The link that was scanned, as a configuration says it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Place {
-    Serial(String),
-    Tcp(String),
-    RtuOverTcp(String),
-}
 
 /// What a scan has found.
 #[derive(Debug)]
@@ -68,18 +60,18 @@ impl Report {
     }
 
     /// `buses` and `devices` as they can stand in the configuration; `None` where nothing was found.
-    pub fn configuration(&self, place: &Place) -> Option<String> {
+    pub fn configuration(&self, link: &Link) -> Option<String> {
         if self.is_empty() {
             return None;
         }
-        let bus = place.bus();
+        let bus = bus_of(link);
         let mut text = format!("# Found by `busker scan`: {}.\n", self.asked());
         for note in self.notes() {
             let _ = writeln!(text, "# {note}");
         }
-        let _ = write!(text, "buses:\n  {bus}:\n    {}\n", place.key());
+        let _ = write!(text, "buses:\n  {bus}:\n    {}\n", key_of(link));
         if let Some(Line { baud, parity, stop_bits }) = self.scan.settled.flatten() {
-            let _ = write!(text, "    baud: {baud}\n    parity: {}\n", parity_name(parity));
+            let _ = write!(text, "    baud: {baud}\n    parity: {}\n", parity);
             if stop_bits != 1 {
                 let _ = writeln!(text, "    stop_bits: {stop_bits}");
             }
@@ -113,10 +105,10 @@ impl Report {
     }
 
     /// The same for programs.
-    pub fn json(&self, place: &Place) -> Json {
+    pub fn json(&self, link: &Link) -> Json {
         let line = self.scan.settled.flatten().map(line_json);
         let found: Vec<Json> =
-            self.scan.found.iter().map(|(unit, found)| found.json(*unit, &place.bus())).collect();
+            self.scan.found.iter().map(|(unit, found)| found.json(*unit, bus_of(link))).collect();
         let garbled = self.scan.garbled.iter().map(|garbled| {
             json!({"unit": garbled.unit, "line": garbled.line.map(line_json), "error": garbled.what.to_string()})
         });
@@ -128,7 +120,7 @@ impl Report {
             "garbled": garbled.collect::<Vec<_>>(),
             "other_master": self.scan.other_masters.is_some(),
             "answers_to_any_unit": self.answers_to_any,
-            "configuration": self.configuration(place),
+            "configuration": self.configuration(link),
         })
     }
 
@@ -271,34 +263,26 @@ fn who(interview: &Interview) -> String {
     }
 }
 
-impl Place {
-    fn bus(&self) -> String {
-        match self {
-            Place::Serial(_) | Place::RtuOverTcp(_) => "line".into(),
-            Place::Tcp(_) => "network".into(),
-        }
+/// What its bus is called.
+const fn bus_of(link: &Link) -> &'static str {
+    match link {
+        Link::Serial { .. } | Link::RtuOverTcp { .. } => "line",
+        Link::Tcp { .. } => "network",
     }
+}
 
-    fn key(&self) -> String {
-        let (key, value) = match self {
-            Place::Serial(path) => ("serial", path),
-            Place::Tcp(address) => ("tcp", address),
-            Place::RtuOverTcp(address) => ("rtu_over_tcp", address),
-        };
-        format!("{key}: {}", Json::from(value.as_str()))
-    }
+/// The link as a configuration says it.
+fn key_of(link: &Link) -> String {
+    let key = match link {
+        Link::Serial { .. } => "serial",
+        Link::Tcp { .. } => "tcp",
+        Link::RtuOverTcp { .. } => "rtu_over_tcp",
+    };
+    format!("{key}: {}", Json::from(link.address()))
 }
 
 fn line_json(line: Line) -> Json {
-    json!({"baud": line.baud, "parity": parity_name(line.parity), "stop_bits": line.stop_bits})
-}
-
-fn parity_name(parity: Parity) -> &'static str {
-    match parity {
-        Parity::None => "none",
-        Parity::Even => "even",
-        Parity::Odd => "odd",
-    }
+    json!({"baud": line.baud, "parity": line.parity.to_string(), "stop_bits": line.stop_bits})
 }
 
 /// `1..247`, `1..247 and 255`.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::*;
 use crate::engine::device::Identify;
 use crate::engine::modbus::{Answer, Identification, LateReply, RequestsOfOthers};
-use crate::engine::settings::Parity;
+use crate::engine::settings::{Link, Parity, Rs485};
 
 const EVEN: Line = SPECIFIED;
 const NONE: Line = Line { baud: 9600, parity: Parity::None, stop_bits: 1 };
@@ -79,7 +79,11 @@ impl Run {
     }
 
     fn configuration(self) -> Option<String> {
-        self.scan.report(true).configuration(&Place::Serial("/dev/ttyUSB0".into()))
+        self.scan.report(true).configuration(&Link::Serial {
+            path: "/dev/ttyUSB0".into(),
+            line: NONE,
+            rs485: Rs485::Auto,
+        })
     }
 
     /// How often this unit was asked for its names there.
@@ -265,7 +269,8 @@ fn another_master_is_told_once() {
 fn one_device_that_does_not_look_at_the_unit_is_one_device() {
     let everybody = run(wanted(vec![], 1..=247), usize::MAX, &mut |_, _, call| clean(named(call)));
     assert_eq!(everybody.found().len(), 247);
-    let text = everybody.scan.report(true).configuration(&Place::Tcp("192.168.1.20:502".into()));
+    let text =
+        everybody.scan.report(true).configuration(&Link::Tcp { host: "192.168.1.20".into(), port: 502 });
     let text = text.expect("a device");
     assert!(text.contains("tcp: \"192.168.1.20:502\"") && text.contains("  ra8_1:\n"), "{text}");
     assert!(!text.contains("ra8_2"), "{text}");
