@@ -12,9 +12,7 @@ use clap::Subcommand;
 use super::configuration::add_profiles;
 use super::output::{self, Table, counted};
 use super::{Failure, configuration};
-use crate::engine::device::{
-    Condition, Device, Encoding, LineControl, Point, PointIndex, Poll, SettingsBy, Unit, WriteRule,
-};
+use crate::engine::device::{Condition, Device, Encoding, Point, PointIndex, Poll, Unit, WriteRule};
 use crate::engine::profile::{self, Library};
 use crate::engine::yaml::Diagnostic;
 
@@ -228,7 +226,7 @@ fn page(device: &Device) -> String {
     );
     page += &things_text(device);
     if let Some(line) = &device.line {
-        page += &format!("\nline:\n  unit: {}\n  settings: {}\n", line.unit_by, settings_text(line));
+        page += &format!("\nline:\n  unit: {}\n  settings: {}\n", line.unit_by, line.settings);
     }
     if !device.left_out.is_empty() {
         page += "\nleft out:\n";
@@ -237,14 +235,6 @@ fn page(device: &Device) -> String {
         page += &format!("  {}: {}\n", left_out.span, left_out.reason.trim());
     }
     page
-}
-
-/// How bit rate and parity are set, and which there are.
-fn settings_text(line: &LineControl) -> String {
-    match &line.settings {
-        SettingsBy::Hand(switches) => switches.clone(),
-        SettingsBy::Register(register) => format!("{} (`busker line`)", register.choices()),
-    }
 }
 
 /// `mode is direct or motor, enabled is ON`

@@ -1,5 +1,7 @@
 //! How a device is told its bit rate, parity and unit.
 
+use std::fmt;
+
 use crate::engine::address::Span;
 
 /// By what the settings of a device on its line are changed. They are no points: written as one, they would cut
@@ -18,6 +20,16 @@ pub enum SettingsBy {
     Hand(String),
 }
 
+impl fmt::Display for SettingsBy {
+    /// By what, and which settings there are, for people.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            SettingsBy::Register(register) => write!(f, "`busker line`: {}", register.choices()),
+            SettingsBy::Hand(switches) => f.write_str(switches),
+        }
+    }
+}
+
 /// A register that takes bit rate and parity in one write, and with them from its answer on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SettingsRegister {
@@ -32,7 +44,7 @@ pub struct SettingsRegister {
 
 impl SettingsRegister {
     /// What can be set, for people: `1200, 2400 baud; parity even, odd`.
-    pub fn choices(&self) -> String {
+    fn choices(&self) -> String {
         let baud: Vec<String> = self.baud.iter().map(|(baud, _)| baud.to_string()).collect();
         let parities = [("even", self.even), ("odd", self.odd), ("none", self.none)];
         let parities: Vec<&str> =

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::{modes, points, things, words};
 use crate::engine::device::{
-    Category, Device, Encoding, Identify, Platform, Point, PointIndex, Poll, SettingsBy, WriteRule,
+    Category, Device, Encoding, Identify, Platform, Point, PointIndex, Poll, WriteRule,
 };
 use crate::engine::homeassistant::Entity;
 use crate::engine::wanted;
@@ -410,13 +410,7 @@ devices:
         }
         if let Some(line) = &self.device.line {
             rows.push(("Its unit is set by", line.unit_by.clone()));
-            rows.push((
-                "Bit rate and parity are set by",
-                match &line.settings {
-                    SettingsBy::Hand(switches) => switches.clone(),
-                    SettingsBy::Register(register) => format!("`busker line`: {}", register.choices()),
-                },
-            ));
+            rows.push(("Bit rate and parity are set by", line.settings.to_string()));
         }
         let _ = writeln!(text, "## On the wire\n\n| | |\n|---|---|");
         for (what, value) in rows {
