@@ -10,7 +10,7 @@ use crate::engine::bus::{Action, Bus, Event};
 use crate::engine::device::{Device, PointIndex};
 use crate::engine::memory::Memories;
 use crate::engine::modbus::guard::Guard;
-use crate::engine::modbus::{Call, Reply, RequestError};
+use crate::engine::modbus::{Call, Reply, Request, RequestError};
 use crate::engine::settings::{DeviceSettings, Settings};
 use crate::engine::time::{Duration, Time};
 use crate::simulator::Plain;
@@ -39,7 +39,7 @@ pub struct Rehearsal<'a> {
 struct Link {
     opens_at: Option<Time>,
     /// The request that waits for the line: what it is, and when it was decided on.
-    to_send: Option<(Asked, Time)>,
+    to_send: Option<(Request, Time)>,
     /// Not before.
     not_before: Time,
     decided_at: Time,
@@ -135,10 +135,10 @@ impl<'a> Rehearsal<'a> {
     }
 
     fn send(&mut self) {
-        let Some((asked, decided_at)) = self.link.to_send.take() else { return };
+        let Some((Request { unit, call, .. }, decided_at)) = self.link.to_send.take() else { return };
         (self.link.decided_at, self.link.sent_at) = (decided_at, self.now);
         self.answer();
-        self.asked.push(Asked { at: self.now, ..asked });
+        self.asked.push(Asked { at: self.now, unit, call });
         self.guard.sent(self.now);
     }
 
@@ -188,8 +188,7 @@ impl<'a> Rehearsal<'a> {
                     match self.guard.begin(self.now, &request, timeout) {
                         Some(reply) => self.bus.handle(self.now, Event::Reply(reply)),
                         None => {
-                            let asked = Asked { at: self.now, unit: request.unit, call: request.call };
-                            self.link.to_send = Some((asked, self.now));
+                            self.link.to_send = Some((request, self.now));
                             self.link.not_before = not_before;
                         }
                     }

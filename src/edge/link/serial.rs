@@ -36,9 +36,7 @@ impl Port {
         }
         Ok(port)
     }
-}
 
-impl Port {
     /// From here on a byte whose parity is wrong is read as 0, and spoils its frame. Otherwise a device with
     /// another parity, which does not check ours, would be heard as if it had the right one.
     pub fn check_parity(&self, parity: Parity) -> Result<(), Errno> {
