@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 
 use busker::engine::address::{Span, Table};
 use busker::engine::device::Device;
-use busker::engine::time::Time;
+use busker::engine::time::{Duration, Time};
 use busker::simulator::device::{Addressed, SimulatedDevice};
 use busker::simulator::{Plain, Stimulus};
 
@@ -19,8 +19,8 @@ pub struct Ledger(Arc<Mutex<BTreeMap<u8, Pages>>>);
 pub struct Pages {
     /// For each point what it held from when on.
     pub texts: Vec<Vec<(Time, String)>>,
-    /// When something changed that nobody had written.
-    pub touched: Vec<Time>,
+    /// When which point changed that nobody had written.
+    touched: Vec<(Time, usize)>,
     pub writes: Vec<Write>,
 }
 
@@ -53,11 +53,17 @@ impl Pages {
             if held == text {
                 return true;
             }
-            if *since <= from {
+            // At the moment of a change both are true: over TCP a request is heard when it is sent.
+            if *since < from {
                 return false;
             }
         }
         false
+    }
+
+    /// Whether one of `points` changed in `within` before `to`, and nobody had written it.
+    pub fn touched(&self, points: &[usize], to: Time, within: Duration) -> bool {
+        self.touched.iter().any(|(at, point)| *at <= to && to.since(*at) < within && points.contains(point))
     }
 
     pub fn holds(&self, point: usize) -> &str {
@@ -75,6 +81,15 @@ pub struct Watched {
     holes: Holes,
 }
 
+/// Who changes what a device holds.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Cause {
+    /// A request, or nobody yet.
+    Gateway,
+    /// Somebody at the device, or its restart.
+    Itself,
+}
+
 /// Addresses that a device does not have, now.
 pub type Holes = Arc<Mutex<Vec<Span>>>;
 
@@ -82,17 +97,20 @@ impl Watched {
     pub fn new(now: Time, unit: u8, device: Arc<Device>, ledger: Ledger, holes: Holes) -> Watched {
         let clears = device.points.iter().any(|point| point.read_clears);
         let watched = Watched { plain: Plain::new((*device).clone()), device, unit, ledger, clears, holes };
-        watched.note(now);
+        watched.note(now, Cause::Gateway);
         watched
     }
 
-    fn note(&self, now: Time) {
+    fn note(&self, now: Time, cause: Cause) {
         let texts = self.plain.texts();
         self.ledger.of(self.unit, |pages| {
             pages.texts.resize(texts.len(), Vec::new());
-            for (history, text) in pages.texts.iter_mut().zip(texts) {
+            for (point, (history, text)) in pages.texts.iter_mut().zip(texts).enumerate() {
                 if history.last().is_none_or(|(_, last)| *last != text) {
                     history.push((now, text));
+                    if cause == Cause::Itself {
+                        pages.touched.push((now, point));
+                    }
                 }
             }
         });
@@ -143,9 +161,9 @@ impl SimulatedDevice for Watched {
             let in_vain = before == self.plain.eeprom();
             let write = Write { at: now, span, words, refused, in_vain };
             self.ledger.of(self.unit, |pages| pages.writes.push(write));
-            self.note(now);
+            self.note(now, Cause::Gateway);
         } else if self.clears {
-            self.note(now);
+            self.note(now, Cause::Gateway);
         }
         answer
     }
@@ -154,14 +172,12 @@ impl SimulatedDevice for Watched {
 
     fn restart(&mut self, now: Time) {
         self.plain.restart(now);
-        self.ledger.of(self.unit, |pages| pages.touched.push(now));
-        self.note(now);
+        self.note(now, Cause::Itself);
     }
 
     fn stimulate(&mut self, now: Time, stimulus: &Stimulus) -> Result<(), String> {
         self.plain.stimulate(now, stimulus)?;
-        self.ledger.of(self.unit, |pages| pages.touched.push(now));
-        self.note(now);
+        self.note(now, Cause::Itself);
         Ok(())
     }
 

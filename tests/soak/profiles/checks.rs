@@ -113,12 +113,8 @@ impl Life {
                 continue;
             }
             let (from, to) = (published.asked_at[usize::from(unit.unit)], published.at);
-            let is_true = self.ledger.of(unit.unit, |pages| {
-                // What decides was changed at the device, and not yet read again.
-                let touched = pages.touched.iter().any(|at| *at <= to && to.since(*at) < SLOW);
-                let may_be_old = !details.selectors().is_empty() && touched;
-                may_be_old || pages.held(index, from, to, text)
-            });
+            let is_true = self.may_be_old(unit, index, to)
+                || self.ledger.of(unit.unit, |pages| pages.held(index, from, to, text));
             if !is_true {
                 let history = self.ledger.of(unit.unit, |pages| {
                     let all =
@@ -133,6 +129,12 @@ impl Life {
         }
     }
 
+    /// Whether what decides about the point was changed at the device, and perhaps not yet read again.
+    fn may_be_old(&self, unit: &Unit, point: usize, at: Time) -> bool {
+        let deciding = unit.device.points[point].selectors();
+        self.ledger.of(unit.unit, |pages| pages.touched(&deciding, at, SLOW))
+    }
+
     pub fn check_commands(&self, seen: &mut Seen) {
         for (number, sent) in self.commands.iter().enumerate() {
             let unit = &self.units[sent.unit];
@@ -144,12 +146,7 @@ impl Life {
             let Some(found) = outcome["found"].as_str() else { continue };
             let Some(point) = unit.device.point_named(&sent.target) else { continue };
             let held = self.ledger.of(unit.unit, |pages| pages.held(point, sent.at, *at, found));
-            let touched = self.ledger.of(unit.unit, |pages| {
-                pages.touched.iter().any(|touched| touched <= at && at.since(*touched) < SLOW)
-            });
-            // What decides was changed at the device, and not yet read again.
-            let may_be_old = touched && !unit.device.points[point].selectors().is_empty();
-            if !held && !may_be_old {
+            if !held && !self.may_be_old(unit, point, *at) {
                 self.fail(&format!(
                     "{what} ended at {at} with {outcome}, which the device did not hold{}",
                     self.world.heard_before(*at, unit.unit)
