@@ -80,6 +80,10 @@ fn lives_of_real_profiles_bring_nothing_false() {
 #[derive(Debug, Default)]
 struct Seen {
     values: usize,
+    /// Those whose meaning other points decide, and that had to be true,
+    decided: usize,
+    /// and those that did not, since what decides had just changed by itself.
+    excused: usize,
     outcomes: BTreeMap<String, usize>,
     writes: BTreeMap<&'static str, usize>,
 }

@@ -18,10 +18,26 @@ pub struct Ledger(Arc<Mutex<BTreeMap<u8, Pages>>>);
 #[derive(Clone, Default)]
 pub struct Pages {
     /// For each point what it held from when on.
-    pub texts: Vec<Vec<(Time, String)>>,
-    /// When which point changed that nobody had written.
-    touched: Vec<(Time, usize)>,
+    pub texts: Vec<Vec<Held>>,
     pub writes: Vec<Write>,
+}
+
+/// What a point held from then on.
+#[derive(Clone, Debug)]
+pub struct Held {
+    pub since: Time,
+    text: String,
+    cause: Cause,
+}
+
+/// Why a point holds something else than before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Cause {
+    Written,
+    /// It is cleared by reading.
+    Read,
+    /// Somebody at the device, or its restart.
+    Itself,
 }
 
 /// A write that reached the device.
@@ -46,15 +62,16 @@ impl Ledger {
 impl Pages {
     /// Whether the point held this at some time between the two.
     pub fn held(&self, point: usize, from: Time, to: Time, text: &str) -> bool {
-        for (since, held) in self.texts[point].iter().rev() {
-            if *since > to {
+        for held in self.texts[point].iter().rev() {
+            if held.since > to {
                 continue;
             }
-            if held == text {
+            if held.text == text {
                 return true;
             }
-            // At the moment of a change both are true: over TCP a request is heard when it is sent.
-            if *since < from {
+            // Over TCP a request is heard when it is sent: what is cleared by it was held then, as was what changes at
+            // the device at that very moment. What was written was not: whoever asked knows of it.
+            if held.since < from || (held.since == from && held.cause == Cause::Written) {
                 return false;
             }
         }
@@ -63,31 +80,24 @@ impl Pages {
 
     /// Whether one of `points` changed in `within` before `to`, and nobody had written it.
     pub fn touched(&self, points: &[usize], to: Time, within: Duration) -> bool {
-        self.touched.iter().any(|(at, point)| *at <= to && to.since(*at) < within && points.contains(point))
+        let is_new = |held: &Held| held.since <= to && to.since(held.since) < within;
+        let by_itself = |held: &Held| held.cause == Cause::Itself && is_new(held);
+        points.iter().any(|point| self.texts[*point].iter().any(by_itself))
     }
 
     pub fn holds(&self, point: usize) -> &str {
-        self.texts[point].last().map_or("", |(_, text)| text)
+        self.texts[point].last().map_or("", |held| &held.text)
     }
 }
 
 pub struct Watched {
-    pub plain: Plain,
+    plain: Plain,
     device: Arc<Device>,
     unit: u8,
     ledger: Ledger,
     clears: bool,
     /// What no firmware has, or not this one.
     holes: Holes,
-}
-
-/// Who changes what a device holds.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Cause {
-    /// A request, or nobody yet.
-    Gateway,
-    /// Somebody at the device, or its restart.
-    Itself,
 }
 
 /// Addresses that a device does not have, now.
@@ -97,7 +107,7 @@ impl Watched {
     pub fn new(now: Time, unit: u8, device: Arc<Device>, ledger: Ledger, holes: Holes) -> Watched {
         let clears = device.points.iter().any(|point| point.read_clears);
         let watched = Watched { plain: Plain::new((*device).clone()), device, unit, ledger, clears, holes };
-        watched.note(now, Cause::Gateway);
+        watched.note(now, Cause::Written);
         watched
     }
 
@@ -105,12 +115,9 @@ impl Watched {
         let texts = self.plain.texts();
         self.ledger.of(self.unit, |pages| {
             pages.texts.resize(texts.len(), Vec::new());
-            for (point, (history, text)) in pages.texts.iter_mut().zip(texts).enumerate() {
-                if history.last().is_none_or(|(_, last)| *last != text) {
-                    history.push((now, text));
-                    if cause == Cause::Itself {
-                        pages.touched.push((now, point));
-                    }
+            for (history, text) in pages.texts.iter_mut().zip(texts) {
+                if history.last().is_none_or(|last| last.text != text) {
+                    history.push(Held { since: now, text, cause });
                 }
             }
         });
@@ -161,9 +168,9 @@ impl SimulatedDevice for Watched {
             let in_vain = before == self.plain.eeprom();
             let write = Write { at: now, span, words, refused, in_vain };
             self.ledger.of(self.unit, |pages| pages.writes.push(write));
-            self.note(now, Cause::Gateway);
+            self.note(now, Cause::Written);
         } else if self.clears {
-            self.note(now, Cause::Gateway);
+            self.note(now, Cause::Read);
         }
         answer
     }

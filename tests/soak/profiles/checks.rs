@@ -6,7 +6,7 @@ use busker::engine::device::{Identify, Point, Poll};
 use busker::engine::time::{Duration, Time};
 
 use super::{Life, Seen, Unit};
-use crate::watched::Write;
+use crate::watched::{Held, Write};
 
 /// What decides about others is polled as often as this, or somewhat less where the line is full.
 const SLOW: Duration = Duration::from_secs(20);
@@ -113,12 +113,16 @@ impl Life {
                 continue;
             }
             let (from, to) = (published.asked_at[usize::from(unit.unit)], published.at);
-            let is_true = self.may_be_old(unit, index, to)
-                || self.ledger.of(unit.unit, |pages| pages.held(index, from, to, text));
+            if self.may_be_old(unit, index, to) {
+                seen.excused += 1;
+                continue;
+            }
+            seen.decided += usize::from(!details.selectors().is_empty());
+            let is_true = self.ledger.of(unit.unit, |pages| pages.held(index, from, to, text));
             if !is_true {
                 let history = self.ledger.of(unit.unit, |pages| {
-                    let all =
-                        pages.texts[index].iter().filter(|(at, _)| at.0 + 60_000_000 > from.0 && *at <= to);
+                    let is_near = |held: &&Held| held.since.0 + 60_000_000 > from.0 && held.since <= to;
+                    let all = pages.texts[index].iter().filter(is_near);
                     format!("{:?}", all.collect::<Vec<_>>())
                 });
                 self.fail(&format!(
@@ -264,17 +268,10 @@ impl Life {
                 {
                     continue;
                 }
-                let holes = unit.holes.lock().expect("nobody panicked").clone();
-                let of_point = [Some(point.at), point.also];
-                let hole =
-                    of_point.iter().flatten().any(|at| holes.iter().any(|hole| hole.overlaps(at.span)));
-                if hole && point.also.is_some() {
+                if point.also.is_some() && self.is_missing(unit, index) {
                     continue;
                 }
-                let holds = match hole {
-                    true => "None".into(),
-                    false => self.ledger.of(unit.unit, |pages| pages.holds(index).to_string()),
-                };
+                let holds = self.holds(unit, index);
                 if says(&point.name) != Some(&holds) {
                     self.fail(&format!(
                         "{}/{} ({}) says {:?} and holds {holds}; {:?}{}",
@@ -294,7 +291,7 @@ impl Life {
     fn check_things(&self, last: &BTreeMap<&str, &str>, unit: &Unit) {
         for thing in unit.device.things.iter().filter(|thing| !thing.states.is_empty()) {
             let says = |what: &str| last.get(&*format!("busker/{}/{what}", unit.name)).copied();
-            let holds = |point: usize| self.ledger.of(unit.unit, |pages| pages.holds(point).to_string());
+            let holds = |point: usize| self.holds(unit, point);
             let state = thing
                 .states
                 .iter()
@@ -310,6 +307,24 @@ impl Life {
                 }
             }
         }
+    }
+
+    /// What whoever reads the point is told now.
+    fn holds(&self, unit: &Unit, point: usize) -> String {
+        match self.is_missing(unit, point) {
+            true => "None".into(),
+            false => self.ledger.of(unit.unit, |pages| pages.holds(point).to_string()),
+        }
+    }
+
+    /// Whether the device does not have the addresses of the point.
+    fn is_missing(&self, unit: &Unit, point: usize) -> bool {
+        let point = &unit.device.points[point];
+        let holes = unit.holes.lock().expect("nobody panicked");
+        [Some(point.at), point.also]
+            .iter()
+            .flatten()
+            .any(|at| holes.iter().any(|hole| hole.overlaps(at.span)))
     }
 
     fn fail(&self, text: &str) -> ! {
