@@ -172,7 +172,7 @@ impl World {
         frames.map(|(_, _, frame)| format!("\n{frame}")).collect()
     }
 
-    /// What was said on the whole line in the twelve seconds before `at`.
+    /// What was said on the whole line in the 24 seconds before `at`.
     pub fn all_heard_before(&self, at: Time) -> String {
         let from = Time(at.0.saturating_sub(24_000_000));
         let frames = self.frames.iter().filter(|(time, ..)| (from..=at).contains(time));
