@@ -1,7 +1,5 @@
 //! What a dead unit costs the others on its line, and how soon its return is noticed.
 
-use busker::engine::configuration;
-use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
 use busker::simulator::LineSettings;
@@ -10,6 +8,7 @@ use busker::simulator::line::Line;
 use busker::simulator::script::Action;
 
 use crate::device::{BLOCK, Diary, Timepiece};
+use crate::load;
 use crate::world::{Published, World};
 
 const UNITS: u8 = 10;
@@ -32,7 +31,7 @@ fn a_unit_that_once_came_late_before_it_died_pays_for_the_silence_that_it_is_giv
     let mut world = world(UNITS);
     world.run_until(world.now + Duration::from_secs(2));
     // Late by 200 ms, once; long ago when it dies.
-    world.act(DEAD, &Action::Fault("unit=10,slow=700ms".parse().expect("a fault")));
+    world.fault(DEAD, "slow=700ms");
     world.run_until(world.now + Duration::from_secs(2));
     world.act(DEAD, &Action::Repair { unit: DEAD });
     world.run_until(world.now + Duration::from_secs(90));
@@ -64,8 +63,7 @@ fn a_unit_that_returns_slower_than_it_went_is_heard_or_spoils_what_others_say_an
             let mut world = with_dead_unit(Duration::from_secs(alive));
             world.run_until(world.now + within * moment / 4);
             power(&mut world, true);
-            let fault = format!("unit={DEAD},slow={slow}ms");
-            world.act(DEAD, &Action::Fault(fault.parse().expect("a fault")));
+            world.fault(DEAD, &format!("slow={slow}ms"));
             let returned_at = world.now;
             world.run_until(returned_at + within);
             let topic = format!("busker/unit_{DEAD}/availability");
@@ -87,7 +85,7 @@ fn on_a_calm_line_the_late_answer_of_a_unit_that_returns_slower_is_heard_and_it_
     world.run_until(world.now + GROWN);
     world.act(dead, &Action::Power { unit: dead, on: true });
     // Longer than a probe of it waits.
-    world.act(dead, &Action::Fault("unit=2,slow=200ms".parse().expect("a fault")));
+    world.fault(dead, "slow=200ms");
     let returned_at = world.now;
     world.run_until(returned_at + within);
     assert!(world.late_replies() > 0 && world.collisions == 0, "{} late", world.late_replies());
@@ -236,8 +234,5 @@ fn gateway(units: u8, poll: &str) -> Settings {
             "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: {poll}}}, points: {{{points}}}}}\n"
         );
     }
-    match configuration::load("dead_unit.yaml", text.as_bytes(), &Library::shipped()) {
-        Ok((settings, _)) => settings,
-        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
-    }
+    load(&text)
 }

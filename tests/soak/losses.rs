@@ -1,16 +1,14 @@
 //! What single requests that are lost cost, and that none is lost for ever.
 
 use busker::engine::bus::{Command, Event};
-use busker::engine::configuration;
-use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
 use busker::simulator::LineSettings;
 use busker::simulator::device::Place;
 use busker::simulator::line::Line;
-use busker::simulator::script::Action;
 
 use crate::device::{BLOCK, BLOCKS, Diary, Timepiece};
+use crate::load;
 use crate::world::{Disturbance, World};
 
 /// By then each read has been answered often.
@@ -24,7 +22,7 @@ fn a_lost_request_to_a_quick_unit_costs_the_others_less_than_its_response_timeou
     let mut world = world(3, "1ms");
     world.run_until(world.now + KNOWN);
     let from = world.now;
-    fault(&mut world, 1, "silent,every=40");
+    world.fault(1, "silent,every=40");
     world.run_until(from + Duration::from_secs(60));
     let requests = requests(&world, from);
     let to_others: Vec<Time> = requests.iter().filter(|(_, unit)| *unit != 1).map(|(at, _)| *at).collect();
@@ -44,7 +42,7 @@ fn a_unit_that_is_slow_now_and_then_is_waited_for_once_that_is_known() {
     for poll in ["1ms", "1s"] {
         let mut world = world(3, poll);
         world.run_until(world.now + KNOWN * 3);
-        fault(&mut world, 2, "slow=330ms,every=60");
+        world.fault(2, "slow=330ms,every=60");
         world.run_until(world.now + Duration::from_secs(20 * 60));
         // Some twenty slow answers, or some hundreds.
         let late = world.late_replies() + u64::from(world.collisions);
@@ -56,7 +54,7 @@ fn a_unit_that_is_slow_now_and_then_is_waited_for_once_that_is_known() {
 fn a_write_is_waited_for_fully_and_so_are_the_reads_behind_it() {
     let mut world = world(3, "100ms");
     world.run_until(world.now + KNOWN);
-    fault(&mut world, 2, "slow=400ms");
+    world.fault(2, "slow=400ms");
     let (device, point, payload) = ("device_2".into(), "level".into(), "7".into());
     world.tell(Event::Command(Command { device, point, payload, retained: false }));
     world.run_until(world.now + Duration::from_secs(4));
@@ -74,7 +72,7 @@ fn what_is_disturbed_in_step_with_the_polls_starves_no_reading() {
         for every in 2..=12 {
             let mut world = world(units, poll);
             world.run_until(world.now + KNOWN);
-            fault(&mut world, 1, &format!("silent,every={every}"));
+            world.fault(1, &format!("silent,every={every}"));
             let from = world.now;
             world.run_until(from + Duration::from_secs(60));
             let longest = without_news(&world, from);
@@ -152,7 +150,7 @@ fn waits_on_line(units: u8, poll: &str) -> Vec<Wait> {
         let mut world = world(units, poll);
         world.run_until(world.now + KNOWN);
         if !of_unit.is_empty() {
-            fault(&mut world, 1, &of_unit);
+            world.fault(1, &of_unit);
         }
         world.disturbance = of_line;
         let (from, answers) = (world.now, world.answers());
@@ -186,10 +184,6 @@ fn requests(world: &World, from: Time) -> Vec<(Time, u8)> {
     world.requests().into_iter().filter(|(at, _)| *at >= from).collect()
 }
 
-fn fault(world: &mut World, unit: u8, fault: &str) {
-    world.act(unit, &Action::Fault(format!("unit={unit},{fault}").parse().expect("a fault")));
-}
-
 /// Units from 1 on with two blocks of readings each, and a register that is written.
 fn world(units: u8, poll: &str) -> World {
     let turnaround = Duration::from_millis(5);
@@ -216,8 +210,5 @@ fn gateway(units: u8, poll: &str) -> Settings {
             "  device_{unit}: {{bus: line, unit: {unit}, poll: {{fast: {poll}}}, points: {{{points}}}}}\n"
         );
     }
-    match configuration::load("losses.yaml", text.as_bytes(), &Library::shipped()) {
-        Ok((settings, _)) => settings,
-        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
-    }
+    load(&text)
 }

@@ -6,6 +6,7 @@
 
 mod dead_unit;
 mod device;
+mod faults;
 mod losses;
 mod profiles;
 mod refusals;
@@ -26,6 +27,7 @@ use busker::simulator::{Fault, LineSettings};
 use fastrand::Rng;
 
 use device::{BLOCK, BLOCKS, Diary, STORED, Store, Timepiece, held};
+use faults::FAULTS;
 use world::{Published, World};
 
 /// The units; the addresses between them belong to nobody, so that a device with a wrong address is
@@ -85,33 +87,6 @@ enum Link {
     Serial,
     Tcp,
 }
-
-/// What happens to a device, for up to half a minute.
-const FAULTS: &[&str] = &[
-    "silent",
-    "silent,every=2",
-    "slow=150ms",
-    "late=450ms,every=2",
-    "late=500ms,every=2",
-    "late=700ms,every=2",
-    "late=700ms,every=3",
-    "late=1s,every=2",
-    "late=1s,every=4",
-    "late=6s,every=5",
-    "dribble=5ms",
-    "garbled",
-    "garbled,every=2",
-    "noisy",
-    "leading-zero",
-    "short",
-    "short,every=3",
-    "other-unit",
-    "exception=4",
-    "exception=2,every=5",
-    "exception=5,every=2",
-    "exception=6,every=2",
-    "reboot=10s",
-];
 
 /// One life of a bus.
 struct Soak {
@@ -174,7 +149,7 @@ impl Soak {
             0..10 => {
                 self.repair(unit);
                 let kind = FAULTS[self.random.usize(..FAULTS.len())];
-                self.world.act(unit, &Action::Fault(format!("unit={unit},{kind}").parse().expect("a fault")));
+                self.world.fault(unit, kind);
             }
             10..25 => self.repair(unit),
             25..27 => self.world.act(unit, &Action::Power { unit, on: false }),
@@ -377,6 +352,12 @@ fn gateway(link: Link) -> Settings {
             device_name(unit)
         );
     }
+    load(&text)
+}
+
+/// The settings that a configuration makes.
+#[track_caller]
+fn load(text: &str) -> Settings {
     match configuration::load("soak.yaml", text.as_bytes(), &Library::shipped()) {
         Ok((settings, _)) => settings,
         Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),

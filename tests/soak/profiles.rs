@@ -21,44 +21,13 @@ use busker::simulator::script::Action;
 use busker::simulator::{LineSettings, Parity, Stimulus};
 use fastrand::Rng;
 
+use crate::faults::{FAULTS, OF_PROFILES};
 use crate::watched::{Holes, Ledger, Watched};
 use crate::world::{Disturbance, World};
 use choices::{make_holes, value_for, with_wishes};
 
 const LIFE: Duration = Duration::from_secs(6 * 60);
 const CALM: Duration = Duration::from_secs(130);
-
-const FAULTS: &[&str] = &[
-    "silent",
-    "silent,every=2",
-    "silent,every=7",
-    "slow=150ms",
-    "slow=350ms,every=3",
-    "late=450ms,every=2",
-    "late=700ms,every=3",
-    "late=1s,every=4",
-    "late=6s,every=5",
-    "dribble=5ms",
-    "garbled",
-    "garbled,every=2",
-    "noisy",
-    "leading-zero",
-    "short,every=3",
-    "other-unit",
-    "exception=4",
-    "exception=2",
-    "exception=2,every=5",
-    "exception=3,every=5",
-    "exception=5,every=2",
-    "exception=6,every=2",
-    "exception=6",
-    "exception=5",
-    "exception=11,every=3",
-    "reboot=10s",
-    "reboot=4s",
-    "wrong-identity",
-    "wrong-identity,every=3",
-];
 
 #[test]
 fn lives_of_real_profiles_bring_nothing_false() {
@@ -271,12 +240,13 @@ impl Life {
         let unit = self.units[index].unit;
         match self.random.u8(0..100) {
             0..8 => {
-                let kind = FAULTS[self.random.usize(..FAULTS.len())];
+                let kinds = [FAULTS, OF_PROFILES].concat();
+                let kind = kinds[self.random.usize(..kinds.len())];
                 // Two at once, now and then.
                 if self.random.u8(..3) > 0 {
                     self.repair(unit);
                 }
-                self.world.act(unit, &Action::Fault(format!("unit={unit},{kind}").parse().expect("a fault")));
+                self.world.fault(unit, kind);
             }
             8..22 => self.repair(unit),
             22..24 => {
@@ -351,7 +321,7 @@ impl Life {
     fn repair(&mut self, unit: u8) {
         self.world.act(unit, &Action::Repair { unit });
         if let Some(always) = self.always {
-            self.world.act(unit, &Action::Fault(format!("unit={unit},{always}").parse().expect("a fault")));
+            self.world.fault(unit, always);
         }
     }
 

@@ -2,8 +2,6 @@
 //! found out; what it leaves unanswered costs the others little; and what was on the wire is counted, however it ended.
 
 use busker::engine::bus::{Command, Event};
-use busker::engine::configuration;
-use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
 use busker::simulator::LineSettings;
@@ -13,6 +11,7 @@ use busker::simulator::script::Action;
 
 use crate::device::{BLOCK, BLOCKS, Diary, STORED, Timepiece};
 use crate::world::World;
+use crate::{device_name, load};
 
 const SERIAL: &str = "serial: /dev/ttyUSB0";
 const UNIT: u8 = 1;
@@ -31,7 +30,7 @@ fn what_is_refused_for_a_moment_is_read_in_one_request_again() {
             world.run_until(world.now + Duration::from_secs(20));
             world.act(UNIT, &Action::Power { unit: UNIT, on: true });
         }
-        fault(&mut world, "exception=2");
+        world.fault(UNIT, "exception=2");
         world.run_until(world.now + Duration::from_secs(5));
         world.act(UNIT, &Action::Repair { unit: UNIT });
         world.run_until(world.now + Duration::from_secs(70));
@@ -47,10 +46,10 @@ fn a_device_that_was_busy_for_long_and_then_refuses_something_once_has_not_refus
     for before in ["exception=6", "silent,every=2"] {
         let mut world = world(SERIAL, "1s");
         world.run_until(world.now + Duration::from_secs(20));
-        fault(&mut world, before);
+        world.fault(UNIT, before);
         world.run_until(world.now + Duration::from_secs(15));
         world.act(UNIT, &Action::Repair { unit: UNIT });
-        fault(&mut world, "exception=2");
+        world.fault(UNIT, "exception=2");
         world.run_until(world.now + Duration::from_secs(3));
         world.act(UNIT, &Action::Repair { unit: UNIT });
         world.run_until(world.now + Duration::from_secs(70));
@@ -65,7 +64,7 @@ fn what_is_refused_for_good_by_a_device_that_gave_it_before_is_found_out_soon() 
     let mut world = world(SERIAL, "1s");
     world.run_until(world.now + Duration::from_secs(20));
     // Its new firmware gives single registers only.
-    fault(&mut world, "exception=2");
+    world.fault(UNIT, "exception=2");
     world.run_until(world.now + Duration::from_secs(20));
     let memory = &world.memories.devices[&device_name(UNIT)];
     assert!(!memory.refused.is_empty());
@@ -108,7 +107,7 @@ fn a_device_that_returns_to_a_full_line_is_back_soon_although_some_of_its_first_
         world.act(UNIT, &Action::Power { unit: UNIT, on: false });
         world.run_until(world.now + Duration::from_secs(20));
         world.act(UNIT, &Action::Power { unit: UNIT, on: true });
-        fault(&mut world, ["silent,every=2", "silent,every=3"][number % 2]);
+        world.fault(UNIT, ["silent,every=2", "silent,every=3"][number % 2]);
         world.run_until(world.now + Duration::from_millis(2000 + 700 * number as u64));
         world.act(UNIT, &Action::Repair { unit: UNIT });
         world.run_until(world.now + Duration::from_secs(10));
@@ -125,7 +124,7 @@ fn a_request_whose_link_ends_under_it_is_counted() {
         for number in 0..20 {
             world.run_until(world.now + Duration::from_millis(5000 + number * 7));
             // It waits for an answer that does not come.
-            fault(&mut world, "silent");
+            world.fault(UNIT, "silent");
             let asked = |world: &World| world.requests().iter().filter(|(_, unit)| *unit == UNIT).count();
             let before = asked(&world);
             while asked(&world) == before {
@@ -145,10 +144,6 @@ fn a_request_whose_link_ends_under_it_is_counted() {
     }
 }
 
-fn fault(world: &mut World, fault: &str) {
-    world.act(UNIT, &Action::Fault(format!("unit={UNIT},{fault}").parse().expect("a fault")));
-}
-
 /// How many requests there are in so many seconds.
 fn requests(world: &mut World, seconds: u64) -> usize {
     let before = world.requests().len();
@@ -164,10 +159,6 @@ fn world(link: &str, fast: &str) -> World {
         line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
     }
     World::new(gateway(link, fast), line)
-}
-
-fn device_name(unit: u8) -> String {
-    format!("device_{unit}")
 }
 
 fn gateway(link: &str, fast: &str) -> Settings {
@@ -189,8 +180,5 @@ fn gateway(link: &str, fast: &str) -> Settings {
             "  {name}: {{bus: line, unit: {unit}, poll: {{fast: {fast}, slow: 1s}}, points: {{{points}}}}}\n"
         );
     }
-    match configuration::load("refusals.yaml", text.as_bytes(), &Library::shipped()) {
-        Ok((settings, _)) => settings,
-        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
-    }
+    load(&text)
 }

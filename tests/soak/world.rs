@@ -160,6 +160,12 @@ impl World {
         self.coming.retain(|(sender, _)| *sender != Some(unit));
     }
 
+    /// From now on the device does something that it should not.
+    pub fn fault(&mut self, unit: u8, fault: &str) {
+        let fault = format!("unit={unit},{fault}").parse().expect("a fault");
+        self.act(unit, &script::Action::Fault(fault));
+    }
+
     /// Bytes that nobody sent come to the gateway.
     pub fn disturb(&mut self, bytes: Vec<u8>) {
         self.coming.push((None, Transmission { at: self.now, bytes }));

@@ -8,6 +8,7 @@ use busker::engine::settings::Settings;
 use fastrand::Rng;
 
 use super::Unit;
+use crate::load;
 
 /// Something that may be written to the point.
 pub fn value_for(random: &mut Rng, device: &Device, point: usize) -> String {
@@ -78,13 +79,6 @@ pub fn with_wishes(random: &mut Rng, text: &mut String) -> Settings {
 
 fn try_load(text: &str) -> Option<Settings> {
     configuration::load("soak.yaml", text.as_bytes(), &Library::shipped()).ok().map(|(settings, _)| settings)
-}
-
-fn load(text: &str) -> Settings {
-    match configuration::load("soak.yaml", text.as_bytes(), &Library::shipped()) {
-        Ok((settings, _)) => settings,
-        Err(faults) => panic!("{}", faults.iter().map(ToString::to_string).collect::<String>()),
-    }
 }
 
 /// Other addresses than before are missing: between points, or some of them.
