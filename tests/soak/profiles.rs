@@ -21,6 +21,7 @@ use busker::simulator::script::Action;
 use busker::simulator::{LineSettings, Parity, Stimulus};
 use fastrand::Rng;
 
+use crate::Seeds;
 use crate::faults::{FAULTS, OF_PROFILES};
 use crate::watched::{Holes, Ledger, Watched};
 use crate::world::{Disturbance, World};
@@ -31,15 +32,17 @@ const CALM: Duration = Duration::from_secs(130);
 
 #[test]
 fn lives_of_real_profiles_bring_nothing_false() {
-    let number = |name| std::env::var(name).ok().map(|count| count.parse().expect("a number"));
-    let first: u64 = number("FIRST_SEED").unwrap_or(1);
+    let seeds = Seeds::wanted(1);
     let mut seen = Seen::default();
-    for seed in first..first + number("SEEDS").unwrap_or(1) {
+    for seed in seeds.all {
         println!("seed {seed}");
         Life::new(seed).run(&mut seen);
     }
     println!("{seen:?}");
-    assert!(seen.values > 500 && seen.writes["to EEPROM"] > 10, "{seen:?}");
+    if !seeds.are_usual {
+        return;
+    }
+    assert!(seen.values > 500 && seen.decided > 100 && seen.writes["to EEPROM"] > 10, "{seen:?}");
     for kind in ["done", "unchanged", "expired", "refused"] {
         assert!(seen.outcomes.contains_key(kind), "no command was ever `{kind}`: {seen:?}");
     }
