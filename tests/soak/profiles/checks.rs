@@ -168,7 +168,10 @@ impl Life {
     }
 
     pub fn check_writes(&self, seen: &mut Seen) {
+        let requests = self.world.requests();
         for (index, unit) in self.units.iter().enumerate() {
+            let to_unit: Vec<Time> =
+                requests.iter().filter(|(_, asked)| *asked == unit.unit).map(|(at, _)| *at).collect();
             let writes = self.ledger.of(unit.unit, |pages| pages.writes.clone());
             let mut last: BTreeMap<usize, Time> = BTreeMap::new();
             let mut worn = 0;
@@ -179,12 +182,14 @@ impl Life {
                         at.is_some_and(|at| at.overlaps(write.span))
                     })
                     .collect();
+                // The device hears it when it is over, and by then the link may have ended, and with it the command.
+                let begun = to_unit.iter().rev().find(|at| **at <= write.at).copied().unwrap_or(write.at);
                 let cause = self.commands.iter().find(|sent| {
                     let Some((ended, outcome)) = &sent.ended else { return false };
                     let kind = outcome["outcome"].as_str().expect("a kind");
                     let wrote = !matches!(kind, "expired" | "unchanged");
                     sent.unit == index
-                        && (sent.at..=*ended).contains(&write.at)
+                        && (sent.at..=*ended).contains(&begun)
                         && (wrote || sent.points.len() > 1)
                         && sent.points.iter().any(|point| points.contains(point))
                 });
