@@ -1,15 +1,19 @@
 //! What a device refuses for a moment is asked as before when the moment is over, and what it refuses for good is
 //! found out; what it leaves unanswered costs the others little; and what was on the wire is counted, however it ended.
 
+use std::collections::BTreeMap;
+
+use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Command, Event};
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
-use busker::simulator::LineSettings;
-use busker::simulator::device::Place;
+use busker::simulator::device::{Place, SimulatedDevice};
 use busker::simulator::line::Line;
 use busker::simulator::script::Action;
+use busker::simulator::{LineSettings, Stimulus};
 
 use crate::device::{BLOCK, BLOCKS, Diary, STORED, Timepiece};
+use crate::watched::{Holes, Ledger, Watched};
 use crate::world::World;
 use crate::{device_name, load};
 
@@ -60,14 +64,49 @@ fn a_device_that_was_busy_for_long_and_then_refuses_something_once_has_not_refus
 }
 
 #[test]
-fn what_is_refused_for_good_by_a_device_that_gave_it_before_is_found_out_soon() {
-    let mut world = world(SERIAL, "1s");
-    world.run_until(world.now + Duration::from_secs(20));
-    // Its new firmware gives single registers only.
-    world.fault(UNIT, "exception=2");
-    world.run_until(world.now + Duration::from_secs(20));
-    let memory = &world.memories.devices[&device_name(UNIT)];
-    assert!(!memory.refused.is_empty());
+fn what_is_refused_for_good_by_a_device_that_gave_it_before_is_found_out_soon_and_the_rest_is_read_again() {
+    let of_input = |first, count| Span::with_count(Table::Input, first, count).expect("a span");
+    let of_holding = |first, count| Span::with_count(Table::Holding, first, count).expect("a span");
+    let all = [of_input(0, 4), of_input(100, 4), of_holding(0, 2)];
+    let of_all = [0, 1, 2, 100, 101, 102].map(|first| of_input(first, 2));
+    let of_all: Vec<Span> = of_all.into_iter().chain([of_holding(0, 2)]).collect();
+    // What is missing since the new firmware, how many points that are, and what therefore is not read in one request.
+    let rows: [(&[Span], usize, &[Span]); 5] = [
+        (&[of_input(1, 1)], 1, &[of_input(0, 2), of_input(1, 2)]),
+        (&[of_input(2, 2)], 2, &[of_input(1, 2), of_input(2, 2)]),
+        (&[of_input(103, 1), of_holding(0, 1)], 2, &[of_input(101, 2), of_input(102, 2), of_holding(0, 2)]),
+        (&[of_input(0, 4)], 4, &[of_input(0, 2), of_input(1, 2), of_input(2, 2)]),
+        (&all, 10, &of_all),
+    ];
+    for (missing, count, expected) in rows {
+        let (mut world, holes) = with_firmware();
+        world.run_until(world.now + Duration::from_secs(20));
+        *holes.lock().expect("nobody panicked") = missing.to_vec();
+        // Ten until it is believed, and a little for the halves that are tried.
+        world.run_until(world.now + Duration::from_secs(15));
+        // All of it changes: what is told is told anew.
+        for span in BLOCKS.map(|first| of_input(first, BLOCK)).into_iter().chain([of_holding(0, STORED)]) {
+            let stimulus = Stimulus::Set { span, words: vec![7; span.count() as usize] };
+            world.act(UNIT, &Action::Stimulate { unit: UNIT, stimulus });
+        }
+        world.run_until(world.now + Duration::from_secs(3));
+        let mut told: BTreeMap<&str, &str> = BTreeMap::new();
+        for published in &world.published {
+            let point = published.message.topic.strip_prefix(&format!("busker/{}/", device_name(UNIT)));
+            told.extend(point.map(|point| (point, &*published.message.payload)));
+        }
+        let registers =
+            told.iter().filter(|(point, _)| point.starts_with("reading") || point.starts_with("level"));
+        let (gone, there): (Vec<_>, Vec<_>) = registers.partition(|(_, payload)| **payload == "None");
+        assert_eq!(gone.len(), count, "{missing:?}: {told:?}");
+        assert_eq!(there.len() + gone.len(), BLOCKS.len() * usize::from(BLOCK) + usize::from(STORED));
+        assert!(there.iter().all(|(_, payload)| **payload == "7"), "{missing:?}: {told:?}");
+        // It is stored once a minute at most.
+        world.run_until(world.now + Duration::from_secs(60));
+        let mut refused = world.memories.devices[&device_name(UNIT)].refused.clone();
+        refused.sort_by_key(|span| (span.table(), span.first()));
+        assert_eq!(refused, expected, "{missing:?}");
+    }
 }
 
 #[test]
@@ -151,14 +190,26 @@ fn requests(world: &mut World, seconds: u64) -> usize {
     world.requests().len() - before
 }
 
+/// A unit whose firmware may be exchanged for one that does not have all addresses.
+fn with_firmware() -> (World, Holes) {
+    let (settings, holes) = (gateway(SERIAL, "1s"), Holes::default());
+    let device = settings.devices[0].device.clone();
+    let watched = Watched::new(Time(0), UNIT, device, Ledger::default(), holes.clone());
+    (world_with(settings, Box::new(watched)), holes)
+}
+
 fn world(link: &str, fast: &str) -> World {
+    world_with(gateway(link, fast), Box::new(Timepiece::new(UNIT, Diary::default())))
+}
+
+fn world_with(settings: Settings, of_unit: Box<dyn SimulatedDevice>) -> World {
     let turnaround = Duration::from_millis(5);
     let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
-    for unit in [UNIT, OTHER] {
-        let at = Place { unit, device: device_name(unit) };
-        line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
+    let of_other: Box<dyn SimulatedDevice> = Box::new(Timepiece::new(OTHER, Diary::default()));
+    for (unit, device) in [(UNIT, of_unit), (OTHER, of_other)] {
+        line.add(Place { unit, device: device_name(unit) }, device).expect("a unit of its own");
     }
-    World::new(gateway(link, fast), line)
+    World::new(settings, line)
 }
 
 fn gateway(link: &str, fast: &str) -> Settings {
