@@ -1,20 +1,18 @@
 //! A changed configuration while the gateway runs.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::os::unix::net::UnixDatagram;
-use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread;
 
 use busker::edge::clock::Clock;
 use busker::engine::time::{Duration, Time};
 
-use rustix::fs::{CWD, FileType, Mode, mknodat};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
 
-use crate::support::{Broker, Gateway, Received, Watcher, find, program};
+use crate::support::{Broker, Gateway, Received, Watcher, find, temporary_folder, wait_for};
 use crate::{json, over_tcp, remembered, simulation};
 
 /// A server of Modbus TCP that answers every read with zeros and remembers when it was asked.
@@ -488,30 +486,27 @@ fn http_stays_where_it_was_if_its_new_address_is_taken() {
 
 #[test]
 fn a_hangup_while_the_gateway_starts_is_a_reload_and_not_its_end() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let file = folder.path().join("busker.yaml");
-    mknodat(CWD, &file, FileType::Fifo, Mode::RWXU, 0).expect("a pipe");
-    let mut child = Command::new(program())
-        .args(["run", "--config"])
-        .arg(&file)
-        .env_remove("JOURNAL_STREAM")
-        .stderr(Stdio::piped())
-        .spawn()
-        .expect("busker starts");
+    let folder = temporary_folder();
     let text = format!(
         "mqtt: {{url: 'mqtt://localhost:1'}}\nhttp: null\nstate_dir: {}\nbuses: {{plant: {{tcp: 'localhost:1'}}}}\n",
         folder.path().display()
     );
-    // Whoever writes a pipe waits for who reads it: the gateway has begun, and cannot go on yet.
-    let mut configuration = File::create(&file).expect("a pipe that is read");
-    kill_process(Pid::from_child(&child), Signal::HUP).expect("it runs");
+    mknodat(CWD, folder.path().join("busker.yaml"), FileType::Fifo, Mode::RWXU, 0).expect("a pipe");
+    let gateway = Gateway::begin(folder, &[]);
+    // Nobody can write into a pipe until somebody reads it: the gateway has begun, and cannot go on yet.
+    let open = || {
+        let pipe = wait_for("its reader", || {
+            rustix::fs::open(gateway.file(), OFlags::WRONLY | OFlags::NONBLOCK, Mode::empty()).ok()
+        });
+        File::from(pipe)
+    };
+    let mut configuration = open();
+    gateway.hang_up();
     configuration.write_all(text.as_bytes()).expect("it reads on");
     drop(configuration);
-    let mut lines = BufReader::new(child.stderr.take().expect("it is piped")).lines().map_while(Result::ok);
     // Before that it may still read the first time, and would read both.
-    assert!(lines.any(|line| line.contains("SIGHUP: reading the configuration again")));
-    File::create(&file).and_then(|mut again| again.write_all(text.as_bytes())).expect("it is read again");
-    assert!(lines.any(|line| line.contains("changes nothing that runs")));
-    kill_process(Pid::from_child(&child), Signal::TERM).expect("it runs");
-    assert!(child.wait().expect("it ends").success());
+    gateway.wait_for_log("SIGHUP: reading the configuration again");
+    open().write_all(text.as_bytes()).expect("it is read again");
+    gateway.wait_for_log("changes nothing that runs");
+    assert!(gateway.terminate().success());
 }

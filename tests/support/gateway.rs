@@ -12,6 +12,9 @@ use tempfile::TempDir;
 
 use super::{Broker, Collected, PATIENCE, collect, end, find, lock, temporary_folder, wait_on};
 
+/// Its configuration, in its folder.
+const FILE: &str = "busker.yaml";
+
 /// The program as it was built for this test.
 pub fn program() -> PathBuf {
     Path::new(env!("CARGO_BIN_EXE_busker")).to_owned()
@@ -68,10 +71,17 @@ impl Gateway {
     }
 
     fn start_at(folder: TempDir, environment: &[(&str, &str)], rest: &str) -> Gateway {
-        let file = write_configuration(&folder, rest);
+        write_configuration(&folder, rest);
+        let mut gateway = Gateway::begin(folder, environment);
+        gateway.http = gateway.listens_at();
+        gateway
+    }
+
+    /// Waits for nothing: its configuration is in the folder, or may come there as its test pleases.
+    pub fn begin(folder: TempDir, environment: &[(&str, &str)]) -> Gateway {
         let mut child = Command::new(program())
             .args(["run", "--config"])
-            .arg(&file)
+            .arg(file_in(folder.path()))
             .env_remove("JOURNAL_STREAM")
             .envs(environment.iter().copied())
             .stdin(Stdio::null())
@@ -83,9 +93,7 @@ impl Gateway {
         let lines = BufReader::new(child.stderr.take().expect("it is piped")).lines();
         let said = log.clone();
         std::thread::spawn(move || lines.map_while(Result::ok).for_each(|line| collect(&said, line)));
-        let mut gateway = Gateway { child, log, http: String::new(), folder: Some(folder) };
-        gateway.http = gateway.listens_at();
-        gateway
+        Gateway { child, log, http: String::new(), folder: Some(folder) }
     }
 
     /// Waits until it has told where it listens.
@@ -175,7 +183,7 @@ impl Gateway {
 
     /// Its configuration file.
     pub fn file(&self) -> PathBuf {
-        self.folder().join("busker.yaml")
+        file_in(self.folder())
     }
 
     /// Its state directory.
@@ -201,8 +209,13 @@ impl Gateway {
     #[track_caller]
     pub fn reload(&self, expected: &str) {
         let before = lock(&self.log.0).len();
-        self.signal(Signal::HUP);
+        self.hang_up();
         self.wait_for_log_from(before, expected);
+    }
+
+    /// Asks it to read its configuration again.
+    pub fn hang_up(&self) {
+        self.signal(Signal::HUP);
     }
 
     /// It runs no longer and has not ended.
@@ -222,7 +235,7 @@ impl Gateway {
     /// Asks it to end, and waits until it has.
     pub fn terminate(mut self) -> ExitStatus {
         self.signal(Signal::TERM);
-        self.child.wait().expect("it ends")
+        super::wait_for("its end", || self.child.try_wait().expect("it is ours"))
     }
 
     /// Ends it without asking.
@@ -245,10 +258,14 @@ fn state_in(folder: &Path) -> PathBuf {
     folder.join("state")
 }
 
+fn file_in(folder: &Path) -> PathBuf {
+    folder.join(FILE)
+}
+
 fn configuration(folder: &Path, rest: &str) -> String {
     format!("http: {{listen: '127.0.0.1:0'}}\nstate_dir: {}\n{rest}", state_in(folder).display())
 }
 
-fn write_configuration(folder: &TempDir, rest: &str) -> PathBuf {
-    super::temporary_file(folder, "busker.yaml", &configuration(folder.path(), rest))
+fn write_configuration(folder: &TempDir, rest: &str) {
+    super::temporary_file(folder, FILE, &configuration(folder.path(), rest));
 }
