@@ -26,17 +26,3 @@ pub const FAULTS: &[&str] = &[
     "exception=6,every=2",
     "reboot=10s",
 ];
-
-/// And of one that is known by its profile: such a device is another one for a while, and refuses all that it has.
-pub const OF_PROFILES: &[&str] = &[
-    "silent,every=7",
-    "slow=350ms,every=3",
-    "exception=2",
-    "exception=3,every=5",
-    "exception=6",
-    "exception=5",
-    "exception=11,every=3",
-    "reboot=4s",
-    "wrong-identity",
-    "wrong-identity,every=3",
-];

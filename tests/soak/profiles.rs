@@ -22,13 +22,27 @@ use busker::simulator::{LineSettings, Parity, Stimulus};
 use fastrand::Rng;
 
 use crate::Seeds;
-use crate::faults::{FAULTS, OF_PROFILES};
+use crate::faults::FAULTS;
 use crate::watched::{Holes, Ledger, Watched};
 use crate::world::{Disturbance, World};
 use choices::{make_holes, value_for, with_wishes};
 
 const LIFE: Duration = Duration::from_secs(6 * 60);
 const CALM: Duration = Duration::from_secs(130);
+
+/// And of one that is known by its profile: such a device is another one for a while, and refuses all that it has.
+const OF_PROFILES: &[&str] = &[
+    "silent,every=7",
+    "slow=350ms,every=3",
+    "exception=2",
+    "exception=3,every=5",
+    "exception=6",
+    "exception=5",
+    "exception=11,every=3",
+    "reboot=4s",
+    "wrong-identity",
+    "wrong-identity,every=3",
+];
 
 #[test]
 fn lives_of_real_profiles_bring_nothing_false() {
