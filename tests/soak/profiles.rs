@@ -25,7 +25,7 @@ use crate::Seeds;
 use crate::faults::FAULTS;
 use crate::watched::{Holes, Ledger, Watched};
 use crate::world::{Disturbance, World};
-use choices::{make_holes, value_for, with_wishes};
+use choices::{choose_touched, choose_writable, make_holes, value_for, with_wishes};
 
 const LIFE: Duration = Duration::from_secs(6 * 60);
 const CALM: Duration = Duration::from_secs(130);
@@ -346,7 +346,7 @@ impl Life {
     fn touch(&mut self, index: usize) {
         let device = self.units[index].device.clone();
         let unit = self.units[index].unit;
-        let point = &device.points[self.random.usize(..device.points.len())];
+        let point = &device.points[choose_touched(&mut self.random, &device)];
         let identity = match &device.identify {
             Some(Identify::Word { at, .. }) => Some(*at),
             _ => None,
@@ -409,7 +409,7 @@ impl Life {
         if count == 0 {
             return;
         }
-        let (target, value, points) = match self.random.usize(..count) {
+        let (target, value, points) = match choose_writable(&mut self.random, &device, &writable, count) {
             at if at < writable.len() => {
                 let point = writable[at];
                 (device.points[point].name.clone(), self.value(&device, point), vec![point])

@@ -10,6 +10,28 @@ use fastrand::Rng;
 use super::Unit;
 use crate::load;
 
+/// A point; each second time one that means what another point decides, if there is such a one.
+pub fn choose_touched(random: &mut Rng, device: &Device) -> usize {
+    let all = 0..device.points.len();
+    let decided: Vec<usize> =
+        all.clone().filter(|point| !device.points[*point].selectors().is_empty()).collect();
+    match random.bool() {
+        true if !decided.is_empty() => decided[random.usize(..decided.len())],
+        _ => random.usize(all),
+    }
+}
+
+/// A number below `count`. The first of them are places in `writable`, and each fourth time it is one of a point that
+/// decides about others, if there is such a one: a mode would else be one setting among a hundred.
+pub fn choose_writable(random: &mut Rng, device: &Device, writable: &[usize], count: usize) -> usize {
+    let decides = |at: &usize| device.points.iter().any(|point| point.selectors().contains(&writable[*at]));
+    let deciding: Vec<usize> = (0..writable.len()).filter(decides).collect();
+    match random.u8(..4) {
+        0 if !deciding.is_empty() => deciding[random.usize(..deciding.len())],
+        _ => random.usize(..count),
+    }
+}
+
 /// Something that may be written to the point.
 pub fn value_for(random: &mut Rng, device: &Device, point: usize) -> String {
     let details = &device.points[point];
