@@ -259,7 +259,7 @@ impl DeviceState {
         if self.values.is_selector(point) {
             self.values.forget_selector(&self.settings.device, point);
             self.wake_reads();
-            self.tell_all(now, context);
+            self.tell_changes(now, context);
         }
     }
 

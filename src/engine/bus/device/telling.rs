@@ -108,7 +108,30 @@ impl DeviceState {
         self.tell_things(now, context);
     }
 
+    /// Tells what has changed, and nothing else: nothing has been read now, so whoever waits for a reading goes on
+    /// waiting, and what was told long ago does not become newer.
+    pub(super) fn tell_changes(&mut self, now: Time, context: &mut Context) {
+        for point in 0..self.settings.device.points.len() {
+            self.tell_if(now, point, false, Duration::MAX, context);
+        }
+        self.tell_things_after(now, Duration::MAX, context);
+    }
+
     pub(super) fn tell(&mut self, now: Time, point: PointIndex, context: &mut Context) {
+        let anyway = self.told.take_wanted(point);
+        let again = self.told_again_after(self.details(point).poll, context.republish);
+        self.tell_if(now, point, anyway, again, context);
+    }
+
+    /// Tells the point if it has changed, was told longer ago than `again`, or `anyway`.
+    fn tell_if(
+        &mut self,
+        now: Time,
+        point: PointIndex,
+        anyway: bool,
+        again: Duration,
+        context: &mut Context,
+    ) {
         let details = &self.settings.device.points[point];
         if details.is_button() {
             return;
@@ -121,8 +144,6 @@ impl DeviceState {
             }
             return;
         }
-        let anyway = self.told.take_wanted(point);
-        let again = self.told_again_after(details.poll, context.republish);
         if !anyway && !self.values.may_be_told(now, point, again) {
             return;
         }
@@ -155,6 +176,11 @@ impl DeviceState {
         }
         let is_fast = self.settings.device.points.iter().any(|point| point.poll == Poll::Fast);
         let again = self.told_again_after(if is_fast { Poll::Fast } else { Poll::Slow }, context.republish);
+        self.tell_things_after(now, again, context);
+    }
+
+    /// The same, and again what was told so long ago.
+    fn tell_things_after(&mut self, now: Time, again: Duration, context: &mut Context) {
         for (index, thing) in self.settings.device.things.iter().enumerate() {
             if thing.states.is_empty() {
                 continue;
@@ -235,7 +261,7 @@ impl DeviceState {
         if available || homeassistant::is_settled(&self.settings.device, self.values.known()) {
             self.announce(context);
         }
-        self.tell_all(now, context);
+        self.tell_changes(now, context);
         self.tell_whole_at_once(now, context);
         self.publish_availability(available, context);
         self.tell_info(now, context);
