@@ -13,36 +13,13 @@ use tempfile::TempDir;
 
 use crate::check::Checker;
 use crate::device::{Diary, STORED, Store};
+use crate::faults::FAULTS;
 use crate::gate::Gate;
 use crate::leak::{Growth, Sample};
 use crate::line::LiveLine;
 use crate::mqtt::Observer;
 use crate::points::{self, Point, UNITS};
 use crate::program::{Busker, Mosquitto};
-
-/// What happens to a device, for up to half a minute.
-const FAULTS: &[&str] = &[
-    "silent",
-    "silent,every=2",
-    "slow=150ms",
-    "late=500ms,every=2",
-    "late=700ms,every=2",
-    "late=700ms,every=3",
-    "late=1s,every=2",
-    "late=1s,every=4",
-    "late=6s,every=5",
-    "dribble=5ms",
-    "garbled",
-    "garbled,every=2",
-    "noisy",
-    "leading-zero",
-    "short",
-    "short,every=3",
-    "other-unit",
-    "exception=4",
-    "exception=6,every=2",
-    "reboot=10s",
-];
 
 /// So long everything is looked at before the first fault, and behind the last.
 const CALM_BEFORE: Duration = Duration::from_secs(8);

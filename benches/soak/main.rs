@@ -13,6 +13,8 @@ mod clock;
 #[path = "../../tests/soak/device.rs"]
 #[allow(dead_code, reason = "the soak on simulated time uses the rest")]
 mod device;
+#[path = "../../tests/soak/faults.rs"]
+mod faults;
 mod gate;
 mod leak;
 mod life;
