@@ -46,8 +46,6 @@ struct Kept {
     /// Of the devices' files.
     folder: PathBuf,
     writer: Writer,
-    /// Devices whose files must not be overwritten.
-    damaged: Mutex<BTreeSet<String>>,
     /// Devices of which it has been said that nothing is remembered.
     unknown: Mutex<BTreeSet<String>>,
 }
@@ -111,7 +109,6 @@ impl StateFiles {
             None => Some(Kept {
                 writer: Writer::start(folder.clone())?,
                 folder,
-                damaged: Mutex::default(),
                 unknown: Mutex::new(unknown.into_iter().map(String::from).collect()),
             }),
         };
@@ -129,13 +126,13 @@ impl StateFiles {
         lock(&self.memories).clone()
     }
 
-    /// What is remembered now, also of these devices, which have come since the start.
+    /// What is remembered now, also of these devices, which have come since the start. A device whose file is found
+    /// damaged stays so until the end, whatever becomes of the file: what this run counts lacks what stood in it.
     pub fn learn<'d>(&self, devices: impl Iterator<Item = &'d str>) -> Memories {
         let Some(kept) = &self.kept else { return self.memories() };
         let mut memories = lock(&self.memories);
-        let mut unkept = None;
         for device in devices {
-            if memories.devices.contains_key(device) {
+            if memories.devices.contains_key(device) || memories.damaged.contains_key(device) {
                 continue;
             }
             match recall(&file_of(&kept.folder, device)) {
@@ -147,13 +144,11 @@ impl StateFiles {
                 Ok(None) => {}
                 Err(reason) => {
                     tracing::warn!("{reason}");
-                    lock(&kept.damaged).insert(device.into());
-                    unkept = Some(reason);
+                    memories.damaged.insert(device.into(), reason);
                 }
             }
         }
-        let unkept = unkept.or_else(|| memories.unkept.clone());
-        Memories { unkept, ..memories.clone() }
+        memories.clone()
     }
 
     /// Goes on from what the others remember, where both are kept.
@@ -168,9 +163,12 @@ impl StateFiles {
     pub fn store(&self, record: Record) {
         // Also what is not kept is remembered until the end: devices may begin anew before.
         let Record { device, memory } = &record;
-        let is_kept = self.kept.as_ref().filter(|kept| !lock(&kept.damaged).contains(device));
-        lock(&self.memories).devices.insert(device.clone(), memory.clone());
-        if let Some(kept) = is_kept {
+        let is_damaged = {
+            let mut memories = lock(&self.memories);
+            memories.devices.insert(device.clone(), memory.clone());
+            memories.damaged.contains_key(device)
+        };
+        if let Some(kept) = self.kept.as_ref().filter(|_| !is_damaged) {
             kept.writer.store(record);
         }
     }
@@ -376,9 +374,20 @@ mod tests {
         {
             fs::write(devices.join(format!("four.json.broken{number}")), "").expect("a file");
         }
-        assert!(files.learn(["four"].into_iter()).unkept.is_some());
-        assert_eq!(files.memories().unkept, None, "the others are kept all the same");
+        let is_unkept_alone = |memories: Memories| {
+            assert_eq!(
+                (memories.unkept, memories.damaged.len()),
+                (None, 1),
+                "the others are kept all the same"
+            );
+            assert!(memories.damaged["four"].contains("cannot be kept aside"), "{:?}", memories.damaged);
+        };
+        is_unkept_alone(files.learn(["four"].into_iter()));
         files.store(Record { device: "four".into(), memory: memory(1) });
+        // What is counted of it is known, and still it is not kept: neither for a bus that begins nor for one that stays.
+        assert_eq!(files.memories().devices["four"], memory(1));
+        is_unkept_alone(files.memories());
+        is_unkept_alone(files.learn(["four"].into_iter()));
         drop(files);
         assert!(devices.join("four.json").is_dir(), "it is not overwritten");
     }

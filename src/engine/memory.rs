@@ -48,6 +48,15 @@ pub struct Memories {
     pub devices: BTreeMap<String, Memory>,
     /// Why nothing can be kept for the next start, if so.
     pub unkept: Option<String>,
+    /// Devices of which alone nothing can be kept, and why: what is kept of them already must not be overwritten.
+    pub damaged: BTreeMap<String, String>,
+}
+
+impl Memories {
+    /// Why nothing can be kept of this device, if so.
+    pub fn unkept_of(&self, device: &str) -> Option<&str> {
+        self.unkept.as_ref().or_else(|| self.damaged.get(device)).map(String::as_str)
+    }
 }
 
 #[derive(Serialize, Deserialize)]

@@ -117,7 +117,11 @@ impl Player {
             "restart" => self.restart(),
             // From the next restart on.
             "setting" => self.change_setting(rest),
-            "nothing-is-kept" => self.memories.unkept = Some("the card is full".into()),
+            "nothing-is-kept" if rest.is_empty() => self.memories.unkept = Some("the card is full".into()),
+            // Of one device.
+            "nothing-is-kept" => {
+                drop(self.memories.damaged.insert(rest.into(), "its file is damaged".into()))
+            }
             "clamps" => self.clamps = true,
             // `another-asks 7 3`: unit 7, three times.
             "another-asks" => {

@@ -65,7 +65,7 @@ impl DeviceState {
             self.polls.replace(reads, self.settings.device.wire.intervals, |point| values.is_selector(point));
         }
         self.upkeep = Upkeep::new(&self.settings.device, &self.settings.wanted, &memory);
-        match &memories.unkept {
+        match memories.unkept_of(&self.settings.name) {
             Some(reason) => self.upkeep.write_nothing(reason),
             None => self.keeping.changed = true,
         }
