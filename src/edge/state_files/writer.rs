@@ -78,6 +78,27 @@ struct Waiting {
     finish: bool,
 }
 
+/// What could not be stored, and lies on the desk again.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Failed {
+    memories: bool,
+    others: bool,
+}
+
+impl Failed {
+    fn any(self) -> bool {
+        self.memories || self.others
+    }
+}
+
+impl Waiting {
+    /// Whether all of it may wait after such a failure. What is counted of EEPROM waits for no other file: a power
+    /// failure must not undo it.
+    fn may_wait(&self, failed: Failed) -> bool {
+        (failed.memories || failed.others && self.memories.is_empty()) && !self.finish
+    }
+}
+
 impl Desk {
     fn lay(&self, what: impl FnOnce(&mut Waiting)) {
         what(&mut self.lock());
@@ -89,7 +110,7 @@ impl Desk {
     }
 
     fn work(&self, folder: &Path) {
-        let mut failed = false;
+        let mut failed = Failed::default();
         loop {
             let batch = self.take(failed);
             let finish = batch.finish;
@@ -100,55 +121,53 @@ impl Desk {
         }
     }
 
-    /// Whether some of it could not be stored, and lies on the desk again; `failed`: as the last time.
-    fn store(&self, folder: &Path, batch: Waiting, failed: bool) -> bool {
+    /// `before`: what failed the last time. Of that people know already.
+    fn store(&self, folder: &Path, batch: Waiting, before: Failed) -> Failed {
         let Waiting { memories, others, finish } = batch;
-        let mut fails = false;
-        let mut could = |path: &Path, what: &str, text: &str| {
+        let could = |path: &Path, what: &str, text: &str, is_known: bool| {
             let Err(error) = replace(path, text) else { return true };
             match finish {
                 true => tracing::error!("{what} is lost, since it cannot be stored: {error}"),
-                false if !failed && !fails => {
+                false if !is_known => {
                     tracing::warn!("`{}` cannot be stored, and is tried again: {error}", path.display());
                 }
                 false => {}
             }
-            fails = true;
             false
         };
+        let mut failed = Failed::default();
         // What has come meanwhile is newer.
         for (name, text) in others {
-            if !could(&folder.with_file_name(name), &format!("what belongs in `{name}`"), &text) {
+            let (path, what) = (folder.with_file_name(name), format!("what belongs in `{name}`"));
+            if !could(&path, &what, &text, before.others || failed.others) {
                 self.lock().others.entry(name).or_insert(text);
+                failed.others = true;
             }
         }
         for (device, memory) in memories {
-            let what = format!("the state of {device}");
-            if !could(&file_of(folder, &device), &what, &memory.to_text()) {
+            let (path, what) = (file_of(folder, &device), format!("the state of {device}"));
+            if !could(&path, &what, &memory.to_text(), before.memories || failed.memories) {
                 self.lock().memories.entry(device).or_insert(memory);
+                failed.memories = true;
             }
         }
-        if failed && !fails {
+        if before.any() && !failed.any() {
             tracing::info!("`{}` can be written again", folder.display());
         }
-        fails
+        failed
     }
 
-    /// Waits for something to store, or for the end. After a failure, what waits may wait.
-    fn take(&self, failed: bool) -> Waiting {
-        let mut waiting = self.lock();
-        if failed && !waiting.finish {
-            let until_finish = |waiting: &mut Waiting| !waiting.finish;
-            let waited = self.changed.wait_timeout_while(waiting, TRY_AGAIN_AFTER, until_finish);
-            waiting = waited.unwrap_or_else(PoisonError::into_inner).0;
-        }
+    /// Waits for something to store, or for the end.
+    fn take(&self, failed: Failed) -> Waiting {
+        let may_wait = |waiting: &mut Waiting| waiting.may_wait(failed);
+        let waited = self.changed.wait_timeout_while(self.lock(), TRY_AGAIN_AFTER, may_wait);
+        let waiting = waited.unwrap_or_else(PoisonError::into_inner).0;
         let nothing_to_do = |waiting: &mut Waiting| {
             waiting.memories.is_empty() && waiting.others.is_empty() && !waiting.finish
         };
         let mut waiting =
             self.changed.wait_while(waiting, nothing_to_do).unwrap_or_else(PoisonError::into_inner);
-        let finish = waiting.finish;
-        Waiting { finish, ..std::mem::take(&mut *waiting) }
+        std::mem::take(&mut *waiting)
     }
 }
 
@@ -162,26 +181,46 @@ fn replace(path: &Path, text: &str) -> io::Result<()> {
 mod tests {
     use super::*;
 
+    fn memory(writes: u64) -> Memory {
+        Memory { persistent_writes: writes, ..Memory::default() }
+    }
+
     #[test]
-    fn what_could_not_be_stored_is_stored_when_there_is_room_again() {
+    fn what_could_not_be_stored_is_stored_when_there_is_room_again_and_a_memory_waits_for_no_other_file() {
         let state_dir = tempfile::tempdir().expect("a folder");
         let folder = state_dir.path().join("devices");
-        let paths = [state_dir.path().join("announced.json"), folder.join("one.json")];
-        for path in &paths {
-            fs::create_dir_all(path.with_extension("json.new")).expect("something is in the way");
+        let [announced, one, two] = ["announced.json", "devices/one.json", "devices/two.json"]
+            .map(|name| state_dir.path().join(name));
+        let lay_memory = |desk: &Desk, device: &str, writes| {
+            desk.lay(|waiting| drop(waiting.memories.insert(device.into(), memory(writes))));
+        };
+        let in_the_way = |path: &Path| path.with_extension("json.new");
+        for path in [&announced, &one] {
+            fs::create_dir_all(in_the_way(path)).expect("something is in the way");
         }
         let desk = Desk::default();
-        desk.lay(|waiting| {
-            waiting.others.insert("announced.json", "{}".into());
-            waiting.memories.insert("one".into(), Memory::default());
-        });
-        assert!(desk.store(&folder, desk.take(false), false));
-        for path in &paths {
-            assert!(!path.exists());
-            fs::remove_dir(path.with_extension("json.new")).expect("it is empty");
-        }
+        lay_memory(&desk, "one", 1);
+        desk.lay(|waiting| drop(waiting.others.insert("announced.json", "{}".into())));
+        let failed = desk.store(&folder, desk.take(Failed::default()), Failed::default());
+        assert_eq!(failed, Failed { memories: true, others: true });
+        lay_memory(&desk, "two", 1);
+        assert!(desk.lock().may_wait(failed), "a full card is not tried again at once");
+        fs::remove_dir(in_the_way(&one)).expect("it is empty");
+        let batch = std::mem::take(&mut *desk.lock());
+        let failed = desk.store(&folder, batch, failed);
+        assert_eq!(failed, Failed { memories: false, others: true });
+        assert!(one.exists() && two.exists() && !announced.exists());
+
+        assert!(desk.lock().may_wait(failed), "only what is still blocked is there");
+        lay_memory(&desk, "two", 2);
+        assert!(!desk.lock().may_wait(failed), "the count waits for no other file");
+        let failed = desk.store(&folder, desk.take(failed), failed);
+        assert_eq!(failed, Failed { memories: false, others: true });
+        assert_eq!(fs::read_to_string(&two).expect("it is stored"), memory(2).to_text());
+
+        fs::remove_dir(in_the_way(&announced)).expect("it is empty");
         desk.lay(|waiting| waiting.finish = true);
         desk.work(&folder);
-        assert!(paths.iter().all(|path| path.exists()), "{paths:?}");
+        assert!(announced.exists());
     }
 }
