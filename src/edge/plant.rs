@@ -13,7 +13,7 @@ use crate::engine::homeassistant;
 use crate::engine::outbox::Outbox;
 use crate::engine::profile::Library;
 use crate::engine::request::{Decision, Desk};
-use crate::engine::settings::Settings;
+use crate::engine::settings::{self, Settings};
 use crate::engine::topics::Topics;
 
 /// The running parts.
@@ -64,6 +64,11 @@ impl Plant {
         parts.desk = Desk::new(&settings, library);
         parts.settings = Arc::new(settings);
         parts.buses = buses;
+    }
+
+    /// HTTP goes by these already, whatever becomes of the rest of a new configuration.
+    pub fn set_http(&self, http: settings::Http) {
+        Arc::make_mut(&mut self.parts().settings).http = http;
     }
 
     pub fn set_buses(&self, buses: Vec<Arc<BusHandle>>) {

@@ -51,7 +51,7 @@ impl App {
             tracing::info!("the new configuration changes nothing that runs");
         }
         if change.http {
-            self.exchange_http(listener, &old, &settings, keys.token.clone())?;
+            self.exchange_http(listener, port, (&old, &settings), keys.token.clone())?;
         }
         self.exchange(&old, settings, library, state, &change)?;
         self.keys = keys;
@@ -242,15 +242,14 @@ impl App {
         self.broker = Some(connect(&self.plant, secrets, self.clock));
     }
 
-    /// An error means that it listens where it did, as far as it still can.
+    /// `port` is where it listens now. An error means that it listens where it did, as far as it still can.
     fn exchange_http(
         &mut self,
         listener: Option<Bound>,
-        old: &Settings,
-        new: &Settings,
+        port: Option<u16>,
+        (old, new): (&Settings, &Settings),
         token: Option<String>,
     ) -> anyhow::Result<()> {
-        let port = self.http_address().map(|address| address.port());
         if let Some(http) = self.http.take() {
             self.runtime.block_on(http.finish());
         }
@@ -260,19 +259,61 @@ impl App {
             (None, Some(listen)) => bind(listen).map(Some),
             (None, None) => Ok(None),
         };
-        let (listener, token, failed) = match bound {
-            Ok(listener) => (listener, token, None),
+        let (listener, failed) = match bound {
+            Ok(listener) => {
+                // What comes behind it may fail, and whoever then goes back has to be understood.
+                self.keys.token = token;
+                self.plant.set_http(new.http.clone());
+                (listener, None)
+            }
             Err(error) => {
                 let before = reload::listened_before(old, port);
-                let before = before.and_then(|before| bind(&before).ok());
-                (before, self.keys.token.clone(), Some(error))
+                (before.and_then(|before| bind(&before).ok()), Some(error))
             }
         };
+        let token = self.keys.token.clone();
         let _inside = self.runtime.enter();
         self.http = listener.map(|listener| Http::serve(listener, self.reporter.clone(), self.clock, token));
         if let Some(address) = self.http_address() {
             tracing::info!("HTTP on http://{address}/health");
         }
         failed.map_or(Ok(()), Err)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::configuration;
+
+    fn settings(http: &str) -> Settings {
+        let text = format!(
+            "mqtt: {{url: 'mqtt://localhost:1'}}\nhttp: {{{http}}}\nbuses: {{a: {{tcp: 'localhost:1'}}}}\n"
+        );
+        configuration::load("busker.yaml", text.as_bytes(), &Library::shipped()).expect("a good one").0
+    }
+
+    /// HTTP goes from one to the other, and nothing else does: whoever then wants the first again gets it.
+    #[track_caller]
+    fn check((old, first): (&str, &str), (new, second): (&str, &str)) {
+        let keys = |token: &str| Keys { password: None, token: Some(token.into()) };
+        let (old, new) = (settings(old), settings(new));
+        let mut app = App::start(old.clone(), Library::shipped(), StateFiles::nowhere()).expect("it runs");
+        app.keys = keys(first);
+        app.exchange_http(None, None, (&old, &new), Some(second.into())).expect("a free port");
+        let change = |wanted: &Settings, token: &str| {
+            reload::compare(&app.plant.settings(), wanted, app.circumstances(&keys(token)))
+        };
+        assert_eq!((change(&new, second).http, change(&old, first).http), (false, true));
+        app.stop();
+    }
+
+    #[test]
+    fn http_goes_back_although_the_new_configuration_came_no_further_than_to_http() {
+        let here = "listen: '127.0.0.1:0'";
+        check((here, "first"), ("listen: 'localhost:0'", "first"));
+        check((here, "first"), (&format!("{here}, token: second"), "second"));
+        // In a file: the settings are the same.
+        check((here, "first"), (here, "second"));
     }
 }
