@@ -151,11 +151,14 @@ impl StateFiles {
         memories.clone()
     }
 
-    /// Goes on from what the others remember, where both are kept.
+    /// Goes on from what the others remember, where both are kept. What they count of a device whose file is damaged
+    /// lacks what stood in it.
     fn take_over(&self, others: &StateFiles) {
         let theirs = others.memories();
-        if theirs.unkept.is_none() {
-            theirs.devices.into_iter().for_each(|(device, memory)| self.store(Record { device, memory }));
+        for (device, memory) in &theirs.devices {
+            if theirs.unkept_of(device).is_none() {
+                self.store(Record { device: device.clone(), memory: memory.clone() });
+            }
         }
     }
 
@@ -388,6 +391,13 @@ mod tests {
         assert_eq!(files.memories().devices["four"], memory(1));
         is_unkept_alone(files.memories());
         is_unkept_alone(files.learn(["four"].into_iter()));
+        // Nor does it take the place of what is remembered elsewhere.
+        let folder = tempfile::tempdir().expect("another folder");
+        let others = StateFiles::open(folder.path(), [].into_iter()).expect("a thread");
+        others.store(Record { device: "four".into(), memory: memory(9) });
+        others.take_over(&files);
+        let expected = [("four", memory(9)), ("one", memory(7)), ("two", memory(2))];
+        assert_eq!(others.memories().devices, expected.map(|(device, of)| (device.into(), of)).into());
         drop(files);
         assert!(devices.join("four.json").is_dir(), "it is not overwritten");
     }

@@ -66,19 +66,21 @@ pub enum Fate {
 
 impl Change {
     /// Things are remembered in another place from now on. Where one of the two keeps nothing, what devices go on with
-    /// from memory is not so any more: each leaves its bus and comes to it again.
+    /// from memory is not so any more: each leaves its bus and comes to it again. So does one of which alone nothing
+    /// is kept in one of the two.
     pub fn remember_elsewhere(
         &mut self,
         (old, before): (&Settings, &Memories),
         (new, now): (&Settings, &Memories),
     ) {
-        if before.unkept.is_none() && now.unkept.is_none() {
-            return;
-        }
+        let is_unkept = |device: &str| before.unkept_of(device).is_some() || now.unkept_of(device).is_some();
         for (bus, fate) in &mut self.buses {
             if let Fate::Stays { leave, come } = fate {
-                *leave = devices_on(old, bus).into_iter().map(|device| device.name).collect();
-                *come = devices_on(new, bus);
+                let left = devices_on(old, bus).into_iter().map(|device| device.name);
+                *leave = left.filter(|name| leave.contains(name) || is_unkept(name)).collect();
+                let mut there = devices_on(new, bus);
+                there.retain(|device| come.contains(device) || is_unkept(&device.name));
+                *come = there;
             }
         }
     }
@@ -406,9 +408,19 @@ devices:
     fn devices_begin_anew_where_nothing_was_or_will_be_kept_of_them() {
         let kept = Memories::default();
         let unkept = Memories { unkept: Some("the card is full".into()), ..Memories::default() };
-        for (before, now, adopted) in
-            [(&kept, &kept, "two"), (&kept, &unkept, "one and two"), (&unkept, &kept, "one and two")]
-        {
+        let damaged = |device: &str| Memories {
+            damaged: [(device.to_string(), "its file is damaged".to_string())].into(),
+            ..Memories::default()
+        };
+        for (before, now, adopted) in [
+            (&kept, &kept, "two"),
+            (&kept, &unkept, "one and two"),
+            (&unkept, &kept, "one and two"),
+            (&damaged("one"), &kept, "one and two"),
+            (&kept, &damaged("one"), "one and two"),
+            (&damaged("two"), &kept, "two"),
+            (&damaged("three"), &damaged("three"), "two"),
+        ] {
             let (old, new, mut change) = change();
             change.remember_elsewhere((&old, before), (&new, now));
             assert_eq!(told(&change, 0, true), ["rules", adopted]);
