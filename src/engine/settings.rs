@@ -13,7 +13,7 @@ use crate::engine::device::{Device, PointIndex};
 use crate::engine::time::Duration;
 use crate::engine::units::Release;
 
-pub use self::mqtt::{ClientCertificate, Layout, Level, Manner, Mqtt, Tls};
+pub use self::mqtt::{ClientCertificate, Layout, Level, Manner, Mqtt, TOPIC_PART_BYTES_MAX, Tls};
 pub use self::units::{UNIT_OF_LINE_MAX, units};
 
 #[derive(Clone, Debug, PartialEq)]

@@ -305,6 +305,8 @@ pub fn outcome_of(set: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::profile::NAME_BYTES_MAX;
+    use crate::engine::settings::TOPIC_PART_BYTES_MAX;
 
     fn laid_out(base: &str, pattern: &str) -> Topics {
         Topics { base: base.into(), layout: Layout::parse(pattern).expect("a layout") }
@@ -319,6 +321,16 @@ mod tests {
         let long = "x".repeat(65_500);
         check_parse("busker", &format!("busker/bridge/request/{long}"), None);
         check_parse("busker", &format!("busker/relays/{long}/set"), None);
+    }
+
+    #[test]
+    fn a_command_is_understood_below_the_longest_base_topic_and_layout() {
+        let name = "n".repeat(NAME_BYTES_MAX);
+        let rest = TOPIC_PART_BYTES_MAX - "{base}//{bus}/{device}/{point}".len();
+        let pattern = format!("{{base}}/{}/{{bus}}/{{device}}/{{point}}", "x".repeat(rest));
+        let topics = laid_out(&"b".repeat(TOPIC_PART_BYTES_MAX), &pattern);
+        let expected = Some(Incoming::Set { device: &name, point: &name });
+        assert_eq!(topics.parse(&topics.of_device(&name, &name).set(&name)), expected);
     }
 
     #[test]

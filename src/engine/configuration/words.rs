@@ -2,8 +2,8 @@
 
 use serde_json::json;
 
-use crate::engine::profile::NAME_BYTES_MAX;
-use crate::engine::settings::{self, Direction, Layout, OnBrokerLoss, Parity, Rs485};
+use crate::engine::profile::{NAME_BYTES_MAX, short_name};
+use crate::engine::settings::{self, Direction, Layout, OnBrokerLoss, Parity, Rs485, TOPIC_PART_BYTES_MAX};
 use crate::engine::units::Release;
 use crate::engine::yaml::{Definitions, Faults, Json, Node, Read, Scalar, choices};
 
@@ -30,10 +30,7 @@ impl Scalar for Name {
     fn parse(text: &str) -> Result<Name, String> {
         let good = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
         if text.starts_with(|c: char| c.is_ascii_lowercase()) && text.chars().all(good) {
-            return match text.len() {
-                0..=NAME_BYTES_MAX => Ok(Name(text.into())),
-                long => Err(format!("a name of {long} characters; expected at most {NAME_BYTES_MAX}")),
-            };
+            return short_name(text).map(Name);
         }
         let right = match suggestion(text) {
             Some(suggestion) => format!("perhaps `{suggestion}`"),
@@ -319,9 +316,6 @@ impl Scalar for BrokerUrl {
     }
 }
 
-/// Names come behind it, and what is longer than a kilobyte is no topic of the gateway's.
-const TOPIC_BYTES_MAX: usize = 255;
-
 /// A topic, or the beginning of topics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Topic(pub String);
@@ -338,8 +332,8 @@ impl Scalar for Topic {
             "a level of it is empty"
         } else if text.chars().any(|c| c.is_control() || c.is_whitespace()) {
             "there is a space in it"
-        } else if text.len() > TOPIC_BYTES_MAX {
-            return Err(format!("a topic of {} bytes; expected at most {TOPIC_BYTES_MAX}", text.len()));
+        } else if text.len() > TOPIC_PART_BYTES_MAX {
+            return Err(format!("a topic of {} bytes; expected at most {TOPIC_PART_BYTES_MAX}", text.len()));
         } else {
             return Ok(Topic(text.into()));
         };
@@ -347,7 +341,7 @@ impl Scalar for Topic {
     }
 
     fn schema() -> Json {
-        json!({"type": "string", "pattern": "^[^$+#/\\s][^+#/\\s]*(/[^+#/\\s]+)*$", "maxLength": TOPIC_BYTES_MAX})
+        json!({"type": "string", "pattern": "^[^$+#/\\s][^+#/\\s]*(/[^+#/\\s]+)*$", "maxLength": TOPIC_PART_BYTES_MAX})
     }
 }
 
@@ -364,7 +358,7 @@ impl Scalar for Layout {
     }
 
     fn schema() -> Json {
-        json!({"type": "string", "pattern": "^\\{base\\}/(([^{}+#/\\s]+|\\{(bus|device)\\})/)+\\{point\\}$"})
+        json!({"type": "string", "pattern": "^\\{base\\}/(([^{}+#/\\s]+|\\{(bus|device)\\})/)+\\{point\\}$", "maxLength": TOPIC_PART_BYTES_MAX})
     }
 }
 

@@ -15,7 +15,7 @@ mod text;
 mod things;
 
 pub use library::Library;
-pub use text::NAME_BYTES_MAX;
+pub use text::{NAME_BYTES_MAX, short_name};
 
 use std::sync::Arc;
 

@@ -65,6 +65,14 @@ choices! { "a quirk", Quirk {
 /// those of a group, a point and a flag.
 pub const NAME_BYTES_MAX: usize = 48;
 
+/// What has only characters of a name, unless it is too long for one.
+pub fn short_name(text: &str) -> Result<String, String> {
+    match text.len() {
+        0..=NAME_BYTES_MAX => Ok(text.into()),
+        long => Err(format!("a name of {long} characters; expected at most {NAME_BYTES_MAX}")),
+    }
+}
+
 /// A name in snake_case: of a point, a group or a flag.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Name(pub String);
@@ -74,10 +82,7 @@ impl Scalar for Name {
 
     fn parse(text: &str) -> Result<Name, String> {
         if is_name(text) {
-            return match text.len() {
-                0..=NAME_BYTES_MAX => Ok(Name(text.into())),
-                long => Err(format!("a name of {long} characters; expected at most {NAME_BYTES_MAX}")),
-            };
+            return short_name(text).map(Name);
         }
         Err(format!("`{text}` is not a name; expected a small letter, then small letters, digits and `_`"))
     }

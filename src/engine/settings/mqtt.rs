@@ -118,14 +118,15 @@ impl Default for Layout {
     }
 }
 
-/// What is longer than a kilobyte is no topic of the gateway's.
-const LAYOUT_BYTES_MAX: usize = 255;
+/// Of a topic in the configuration, and of a layout. A base topic and a layout together, with the longest names in
+/// their places, are still short enough to be understood as the topic of a command.
+pub const TOPIC_PART_BYTES_MAX: usize = 255;
 
 impl Layout {
     /// Reads `{base}/{bus}/{device}/{point}`; an error says why it cannot be a layout.
     pub fn parse(text: &str) -> Result<Layout, String> {
-        if text.len() > LAYOUT_BYTES_MAX {
-            return Err(format!("it has {} bytes; expected at most {LAYOUT_BYTES_MAX}", text.len()));
+        if text.len() > TOPIC_PART_BYTES_MAX {
+            return Err(format!("it has {} bytes, more than {TOPIC_PART_BYTES_MAX}", text.len()));
         }
         let texts: Vec<&str> = text.split('/').collect();
         let inner = match texts[..] {
