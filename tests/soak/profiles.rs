@@ -9,6 +9,7 @@ mod choices;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use busker::engine::arrivals::Errand;
 use busker::engine::bus::{Command, Event};
 use busker::engine::device::{Device, Form, Identify};
 use busker::engine::profile::Library;
@@ -390,7 +391,8 @@ impl Life {
             5 => ("scan", r#"{"bus":"line","units":"40..44"}"#.to_string()),
             _ => ("diagnostics", format!(r#"{{"device":"{name}"}}"#)),
         };
-        match self.desk.take(Date(0), verb, &payload, false) {
+        let request = Errand::Request { verb: verb.into(), payload, retained: false, stale: None };
+        match self.desk.decide(Date(0), request) {
             Decision::Ask(_, request) => {
                 self.requests += 1;
                 self.world.tell(Event::Request(request));

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use busker::engine::address::{Span, Table};
+use busker::engine::arrivals::Errand;
 use busker::engine::bus::{Action, Bus, Command, Event, Saved, Severity, Telling};
 use busker::engine::memory::{Memories, Memory, Record};
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError, RequestsOfOthers};
@@ -33,6 +34,11 @@ pub fn replay(transcript: &str) -> String {
         }
     }
     player.expect("a transcript in which something happens").text
+}
+
+/// What somebody asks over MQTT.
+pub fn request(verb: &str, payload: &str) -> Errand {
+    Errand::Request { verb: verb.into(), payload: payload.into(), retained: false, stale: None }
 }
 
 /// `   9.5 ms  text`
@@ -161,7 +167,7 @@ impl Player {
                 let (verb, payload) = rest.split_once(' ').unwrap_or((rest, ""));
                 // 2026-01-01 00:00:00 UTC, and as long after it as the transcript runs.
                 let today = Date(1_767_225_600 + self.now.0 / 1_000_000);
-                match self.desk.take(today, verb, payload, false) {
+                match self.desk.decide(today, request(verb, payload)) {
                     Decision::Ask(_, request) => self.bus.handle(self.now, Event::Request(request)),
                     Decision::Answer(message) => self.write(&format!("answer {}", message.payload)),
                     other => panic!("{other:?}"),

@@ -14,6 +14,7 @@ use busker::engine::topics::Message;
 use proptest::prelude::*;
 
 use crate::devices;
+use crate::play::request;
 
 const DEVICES: &str = "device relays 1 relays\ndevice meter 2 selectable\ndevice board 3 clamping\n\
     device holes 4 holes\ndevice cellar 5 identified\ndiscovery\n\
@@ -237,7 +238,7 @@ impl Observed {
             }
             Happening::Request(index) => {
                 let (verb, payload) = REQUESTS[*index];
-                match self.desk.take(Date(0), verb, payload, false) {
+                match self.desk.decide(Date(0), request(verb, payload)) {
                     Decision::Ask(_, request) => {
                         self.requests += 1;
                         self.handle(Event::Request(request));

@@ -6,6 +6,7 @@ use super::announcement::{Announcement, Gateway};
 use super::diagnostics::{Place, object};
 use crate::engine::device::Poll;
 use crate::engine::health::TOLD_EVERY;
+use crate::engine::keys::{CONNECTION, LINK};
 use crate::engine::settings::Settings;
 use crate::engine::topics::{Message, OFFLINE, ONLINE, Topics};
 
@@ -56,13 +57,13 @@ pub fn announce_bridge(gateway: &Gateway) -> Announcement {
         "name": "Connection",
         "device_class": "connectivity",
         "entity_category": "diagnostic",
-        "unique_id": format!("{identity}_connection"),
-        "default_entity_id": format!("binary_sensor.{}_connection", topics.bridge_identity()),
+        "unique_id": format!("{identity}_{CONNECTION}"),
+        "default_entity_id": format!("binary_sensor.{identity}_{CONNECTION}"),
         "state_topic": topics.bridge_state(),
         "payload_on": ONLINE,
         "payload_off": OFFLINE,
     });
-    let components = vec![("connection".to_string(), object(connection))];
+    let components = vec![(CONNECTION.to_string(), object(connection))];
     Announcement::new(gateway, &identity, device, &[], components)
 }
 
@@ -93,7 +94,7 @@ pub fn announce_bus(gateway: &Gateway, bus: &str) -> Announcement {
     };
     let link = json!({"device_class": "connectivity"});
     let mut components = vec![
-        place.entity("binary_sensor", "link", "Link", "'ON' if OBJECT.up else 'OFF'", link),
+        place.entity("binary_sensor", LINK, "Link", "'ON' if OBJECT.up else 'OFF'", link),
         place.load("Load", true),
         place.period(Poll::Fast.name(), "Period of fast polls", false),
         place.period(Poll::Slow.name(), "Period of slow polls", false),

@@ -95,7 +95,7 @@ impl Desk {
     }
 
     /// A message on the topic of the request `verb`. `today` is only told.
-    pub fn take(&mut self, today: Date, verb: &str, payload: &str, retained: bool) -> Decision {
+    fn take(&mut self, today: Date, verb: &str, payload: &str, retained: bool) -> Decision {
         if retained {
             if payload.is_empty() || !self.warned.insert(verb.into()) {
                 return Decision::Ignore;
