@@ -148,10 +148,7 @@ pub fn of_device(device: &Device) -> BTreeMap<String, BTreeSet<Owner>> {
     };
     for (index, point) in device.points.iter().enumerate() {
         // Whether it is there whenever the point is. A climate steps back where it cannot show its temperatures.
-        let is_always = |thing: &&Thing| {
-            let lives_as_long = thing.when.is_empty() || thing.when == point.when;
-            lives_as_long && thing.kind != ThingKind::Climate
-        };
+        let is_always = |thing: &&Thing| thing.lives_with(point) && thing.kind != ThingKind::Climate;
         let (always, at_times): (Vec<&Thing>, Vec<&Thing>) = device.things.iter().partition(is_always);
         let is_shown = always.iter().any(|thing| thing.shows(index));
         let is_commanded = always.iter().any(|thing| thing.commands_point(index));

@@ -35,7 +35,8 @@ impl Message {
 
     /// Whether it says of a device whether it is there, or what it lacks. Of one that is well only values are told.
     pub fn says_how_a_device_is(&self) -> bool {
-        self.topic.ends_with("/availability") || self.topic.ends_with("/info")
+        let last = self.topic.rsplit_once('/').map(|(_, last)| last);
+        last == Some(AVAILABILITY) || last == Some(INFO)
     }
 }
 
@@ -389,6 +390,8 @@ mod tests {
         ] {
             assert_eq!(topics.kind(&topic), expected, "{topic}");
             assert_eq!(topics.parse(&topic), None, "{topic}");
+            let says_how_it_is = matches!(expected, Kind::Availability | Kind::Info);
+            assert_eq!(Message::once(topic, "").says_how_a_device_is(), says_how_it_is, "{expected:?}");
         }
     }
 

@@ -1,6 +1,6 @@
 //! Several points that are one thing to a person: a blind, a damper, a controller.
 
-use crate::engine::device::{Condition, Platform, PointIndex, Presentation};
+use crate::engine::device::{Condition, Platform, Point, PointIndex, Presentation};
 
 /// One thing, with a name and a topic of its own beside its points'.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,6 +45,11 @@ impl Thing {
     pub fn shows(&self, point: PointIndex) -> bool {
         let in_rows = || self.states.iter().flat_map(|state| &state.row).any(|(shown, _)| *shown == point);
         self.target == Some(point) || in_rows()
+    }
+
+    /// Whether it is there whenever the point is, as far as their conditions say.
+    pub fn lives_with(&self, point: &Point) -> bool {
+        self.when.is_empty() || self.when == point.when
     }
 
     /// Whether some command of it writes this point.

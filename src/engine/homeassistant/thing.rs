@@ -53,7 +53,7 @@ pub(super) fn as_shown<'d>(
             return None;
         }
         shown.point.to_mut().write = None;
-        if !thing.when.is_empty() && thing.when != point.when {
+        if !thing.lives_with(point) {
             shown.key_ending = STATE_ENDING;
         }
     }
