@@ -33,11 +33,11 @@ pub struct CommandFlow {
 }
 
 /// The exception of a device that does not take the value. Some say so, too, when they take the nearest one.
-const ILLEGAL_VALUE: u8 = 3;
+pub const ILLEGAL_VALUE: u8 = 3;
 /// "Accepted, and it will take long": the exception that says nothing is wrong.
 pub const ACKNOWLEDGE: u8 = 5;
 /// The device has done nothing, and wants to be asked again.
-const BUSY: u8 = 6;
+pub const BUSY: u8 = 6;
 pub const ACCEPTED: &str = "the device has accepted it, and takes its time (exception 5, acknowledge)";
 /// A device that is busy is asked again after this, and so often.
 pub const PAUSE_BUSY: Duration = Duration::from_millis(200);

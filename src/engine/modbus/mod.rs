@@ -175,6 +175,11 @@ impl fmt::Display for RequestError {
 }
 
 impl RequestError {
+    /// What stands behind it where people are told of it: `; check …`, or nothing.
+    pub fn advice(&self) -> String {
+        self.what_to_check().map_or_else(String::new, |check| format!("; {check}"))
+    }
+
     /// Where to look when it comes again and again: each has other causes.
     pub const fn what_to_check(&self) -> Option<&'static str> {
         match self {

@@ -1,7 +1,7 @@
 //! What a device does with commands: which it can take, what is asked for them, and what follows.
 
 use crate::engine::codec;
-use crate::engine::command::{CommandFlow, Outcome, OutcomeKind};
+use crate::engine::command::{BUSY, CommandFlow, Outcome, OutcomeKind};
 use crate::engine::device::PointIndex;
 use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::plan::Read;
@@ -273,7 +273,7 @@ impl DeviceState {
         result: &Result<Answer, RequestError>,
         context: &mut Context,
     ) -> u64 {
-        let writes = self.wear.end(*result != Err(RequestError::Exception(6)));
+        let writes = self.wear.end(*result != Err(RequestError::Exception(BUSY)));
         if writes > 0 {
             self.counters.persistent_writes += writes;
             self.keeping.is_to_be_kept_soon(now, context);

@@ -1,5 +1,6 @@
 //! Whether a device is there: how it comes and goes, and what its silence and its late answers say.
 
+use crate::engine::command::{ACKNOWLEDGE, BUSY};
 use crate::engine::homeassistant;
 use crate::engine::identity;
 use crate::engine::modbus::{Answer, Discarded, Reply, RequestError};
@@ -48,7 +49,7 @@ impl DeviceState {
                 }
                 Err(found) => self.mistake(now, found, context),
             },
-            (Err(error @ RequestError::Exception(5 | 6)), _) => {
+            (Err(error @ RequestError::Exception(ACKNOWLEDGE | BUSY)), _) => {
                 self.lose(now, &format!("it answers its identification with {error}"), context);
                 self.paused_until = now + PAUSE_BUSY_LONG;
             }
@@ -138,7 +139,7 @@ impl DeviceState {
     /// It has failed so often that it counts as offline.
     fn be_missed(&mut self, now: Time, error: &RequestError, context: &mut Context) {
         if self.patience.failures() == FAILURES_UNTIL_OFFLINE {
-            let advice = error.what_to_check().map_or(String::new(), |advice| format!("; {advice}"));
+            let advice = error.advice();
             let reason = format!("{error}, {FAILURES_UNTIL_OFFLINE} times in a row{advice}");
             context.say(Severity::Warning, format!("device {} is offline: {reason}", self.settings.name));
             self.lose(now, &reason, context);

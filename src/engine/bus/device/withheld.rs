@@ -4,6 +4,7 @@
 //! Such a read is not the device's end. It is asked ever less often, so that waiting for it costs the bus
 //! little; its points say `None` and why; and the device is online with the rest.
 
+use crate::engine::command::{ACKNOWLEDGE, BUSY};
 use crate::engine::device::Poll;
 use crate::engine::modbus::RequestError;
 use crate::engine::time::{Duration, Time};
@@ -148,7 +149,7 @@ impl DeviceState {
     /// The device answered a read with an exception: it is there, but will not tell this.
     pub(super) fn refused(&mut self, now: Time, index: usize, code: u8, context: &mut Context) {
         let read = self.polls.read(index).clone();
-        if matches!(code, 5 | 6) {
+        if matches!(code, ACKNOWLEDGE | BUSY) {
             let was_answered = self.polls.has_been_answered(index);
             let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
             withheld.refused_since = None;

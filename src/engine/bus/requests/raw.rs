@@ -5,7 +5,7 @@ use serde_json::json;
 use crate::engine::address::{Span, Table};
 use crate::engine::bus::Context;
 use crate::engine::bus::device::DeviceState;
-use crate::engine::command::{ACCEPTED, ACKNOWLEDGE, BUSY_MAX, PAUSE_BUSY, words_of};
+use crate::engine::command::{ACCEPTED, ACKNOWLEDGE, BUSY, BUSY_MAX, ILLEGAL_VALUE, PAUSE_BUSY, words_of};
 use crate::engine::device::{PointIndex, WriteFunction};
 use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
 use crate::engine::request::Status;
@@ -119,8 +119,8 @@ impl RawWrite {
             State::Writing => {
                 let doubt = match result {
                     Ok(_) => None,
-                    Err(RequestError::Exception(3)) if device.clamps_with_exception() => {
-                        Some(RequestError::Exception(3))
+                    Err(error @ RequestError::Exception(ILLEGAL_VALUE)) if device.clamps_with_exception() => {
+                        Some(error)
                     }
                     Err(ACCEPTED_ONLY) => Some(ACCEPTED_ONLY),
                     Err(RequestError::Exception(code)) => return self.refused(code),
@@ -171,7 +171,7 @@ impl RawWrite {
     fn busy_with(&self, result: &Result<Answer, RequestError>) -> Option<Call> {
         let is_writing = matches!(self.state, State::Writing);
         let is_busy = match result {
-            Err(RequestError::Exception(6)) => true,
+            Err(RequestError::Exception(BUSY)) => true,
             Err(ACCEPTED_ONLY) => !is_writing,
             _ => false,
         };
