@@ -104,7 +104,8 @@ struct BusSummary {
     link: String,
     /// `19200 8E1`, where there is a line.
     line: Option<String>,
-    /// Seconds of wire that polls, watchdogs and heartbeats want in a second; above 1 every period is longer by as much.
+    /// As [`Forecast::load`]: the share of time that the rehearsal found the wire taken; above 1, how much longer
+    /// every period is, or nearly so.
     load: f64,
     /// How long a command waits at most for a request in flight, in seconds: all devices answering.
     command_wait: f64,
@@ -188,7 +189,7 @@ impl Summary {
                 let advice = bus.advice.join("; or ");
                 let slower = digits(bus.load);
                 text.push_str(&format!(
-                    "  too slow: every period is {slower} times as long as wanted; {advice}\n"
+                    "  too slow: every period is about {slower} times as long as wanted; {advice}\n"
                 ));
             }
             let mut table = Table::new();

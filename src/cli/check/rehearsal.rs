@@ -27,7 +27,7 @@ pub struct Rehearsal<'a> {
     guard: Guard,
     link: Link,
     players: Vec<Player>,
-    /// Reads that were on the wire, the oldest first; whoever looks at them takes them away.
+    /// Requests of every kind that were on the wire, the oldest first; whoever looks at them takes them away.
     pub asked: Vec<Asked>,
     /// For how long the wire could do nothing else.
     pub busy: Duration,
