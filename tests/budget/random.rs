@@ -7,6 +7,7 @@ use std::fmt::Write;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use busker::engine::time::{Duration, Time};
+use fastrand::Rng;
 use serde_json::Value as Json;
 
 use super::check;
@@ -19,23 +20,13 @@ const ROUNDS: usize = 12;
 /// The slow reads of a unit are far from its fast ones.
 const SLOW_FROM: u16 = 500;
 
-/// Numbers as good as random, and always the same.
-struct Chance(u64);
+/// One as likely between 1 and 10 as between 10 and 100.
+fn log(random: &mut Rng, from: f64, to: f64) -> u64 {
+    (from * libm::pow(to / from, random.f64())) as u64
+}
 
-impl Chance {
-    fn below(&mut self, end: u64) -> u64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) % end
-    }
-
-    fn one_of<T: Copy>(&mut self, all: &[T]) -> T {
-        all[self.below(all.len() as u64) as usize]
-    }
-
-    /// One as likely between 1 and 10 as between 10 and 100.
-    fn log(&mut self, from: f64, to: f64) -> u64 {
-        (from * libm::pow(to / from, self.below(1000) as f64 / 1000.0)) as u64
-    }
+fn one_of<T: Copy>(random: &mut Rng, all: &[T]) -> T {
+    *random.choice(all).expect("some")
 }
 
 struct Case {
@@ -45,28 +36,27 @@ struct Case {
 }
 
 fn case(seed: u64) -> Case {
-    let mut chance = Chance(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15));
-    chance.below(1);
-    let baud = chance.one_of(&[4800, 9600, 19200, 19200, 38400, 115_200]);
-    let parity = chance.one_of(&["none", "even"]);
-    let turnaround = chance.log(1.0, 40.0);
-    let busy = chance.log(1.0, 12.0);
-    let units = 1 + chance.below(12);
+    let random = &mut Rng::with_seed(seed);
+    let baud = one_of(random, &[4800, 9600, 19200, 19200, 38400, 115_200]);
+    let parity = one_of(random, &["none", "even"]);
+    let turnaround = log(random, 1.0, 40.0);
+    let busy = log(random, 1.0, 12.0);
+    let units = 1 + random.u64(..12);
     let link = match seed % NETWORK_EACH {
         0 => "tcp: \"10.0.0.1:502\"".to_string(),
         _ => format!("serial: /dev/serial/by-id/usb-A, baud: {baud}, parity: {parity}"),
     };
     let mut configuration = format!("buses:\n  line: {{{link}, response_timeout: 500ms}}\ndevices:\n");
     for unit in 1..=units {
-        let fast = chance.log(30.0, 3000.0) * busy;
-        let slow = fast * (1 + chance.below(15));
-        let delay = if chance.below(4) == 0 { chance.log(5.0, 200.0) } else { 0 };
-        let apart = chance.one_of(&[1, 1, 2, 9]);
+        let fast = log(random, 30.0, 3000.0) * busy;
+        let slow = fast * (1 + random.u64(..15));
+        let delay = if random.u64(..4) == 0 { log(random, 5.0, 200.0) } else { 0 };
+        let apart = one_of(random, &[1, 1, 2, 9]);
         let mut points = Vec::new();
-        for number in 0..1 + chance.below(20) {
+        for number in 0..1 + random.u64(..20) {
             points.push(format!("f{number}: {{at: holding {}, type: u16, poll: fast}}", number * apart));
         }
-        for number in 0..chance.below(12) {
+        for number in 0..random.u64(..12) {
             let address = u64::from(SLOW_FROM) + number * apart;
             points.push(format!("s{number}: {{at: input {address}, type: u16, poll: slow}}"));
         }
@@ -78,7 +68,7 @@ fn case(seed: u64) -> Case {
         );
     }
     if seed % WATCHDOG_EACH == 0 {
-        let (watchdog, fast) = (chance.one_of(&["2s", "5s", "30s"]), chance.log(300.0, 20_000.0));
+        let (watchdog, fast) = (one_of(random, &["2s", "5s", "30s"]), log(random, 300.0, 20_000.0));
         let _ = writeln!(
             configuration,
             "  relays: {{bus: line, unit: {RELAYS}, profile: metz-connect/mr-do4, \
