@@ -151,8 +151,8 @@ fn faults_of(seed: u64) -> Vec<String> {
     faults
 }
 
-/// The watchdog waits no longer than is forecast, but nearly as long: while all answer, and while one unit after the other dies, at moments
-/// that keep no step with the polls, and returns.
+/// The watchdog waits no longer than is forecast, but nearly as long: while all answer, and while one unit after the other
+/// dies, at moments that keep no step with the relays' polls, and returns.
 fn faults_of_feeding(seed: u64, units: u8, feeding: &Json, wire: &mut Wire) -> Vec<String> {
     let mut faults = Vec::new();
     let mut at_most = |what: &str, found: f64| {
@@ -165,11 +165,12 @@ fn faults_of_feeding(seed: u64, units: u8, feeding: &Json, wire: &mut Wire) -> V
         }
     };
     at_most("fed_every", wire.longest_wait(RELAYS));
+    let periods = wire.periods();
     let mut worst = 0.0_f64;
     for number in 0..DEATHS {
         wire.asked.clear();
-        wire.run_until(wire.now + Duration::from_millis(6_000 + 317 * number % 5_000));
         let unit = 1 + (number % u64::from(units)) as u8;
+        wire.run_until(soon_before_its_rarest(wire, &periods, unit, 317 * number % 2_000));
         wire.set_dead(unit, true);
         wire.run_until(wire.now + Duration::from_millis(8_000));
         worst = worst.max(wire.longest_wait(RELAYS));
@@ -180,6 +181,22 @@ fn faults_of_feeding(seed: u64, units: u8, feeding: &Json, wire: &mut Wire) -> V
     faults
 }
 
-const DEATHS: u64 = 24;
+/// So long before the unit is asked for what it is asked for most seldom: then most of its reads are due together.
+fn soon_before_its_rarest(wire: &Wire, periods: &Periods, unit: u8, millis: u64) -> Time {
+    let of_unit = periods.iter().filter(|((of, _), _)| *of == unit);
+    let ((_, rarest), period) = of_unit.max_by(|one, other| one.1.total_cmp(other.1)).expect("it is polled");
+    let mut asked = wire.ever.iter().rev();
+    let last = asked.find(|asked| (asked.unit, asked.address) == (unit, *rarest)).expect("it was asked");
+    let mut moment = last.at;
+    while moment < wire.now + Duration::from_millis(6_000 + millis) {
+        moment += Duration::from_secs_f64(*period);
+    }
+    Time(moment.0 - millis * 1_000)
+}
+
+/// Seconds, by unit and address.
+type Periods = BTreeMap<(u8, u16), f64>;
+
+const DEATHS: u64 = 60;
 /// What is forecast is the longest of all waits, and a test sees only some.
 const NEARLY: f64 = 0.7;

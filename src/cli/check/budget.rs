@@ -87,6 +87,12 @@ impl Budget {
         self.reads.iter().map(|read| read.time + read.rest).fold(0.0, f64::max)
     }
 
+    /// How many requests a device has to answer again and again: its reads, and a heartbeat.
+    pub fn asked_again_and_again(&self, device: usize) -> usize {
+        let reads = self.reads.iter().filter(|read| read.device == device && read.period.is_some());
+        reads.count() + usize::from(!self.wants[device].beats.is_empty())
+    }
+
     /// How long it takes to read everything once that is read again and again.
     pub fn round(&self) -> f64 {
         self.reads.iter().filter(|read| read.period.is_some()).map(|read| read.time + read.rest).sum()

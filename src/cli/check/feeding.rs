@@ -5,13 +5,15 @@
 //! does not say what that time is, only the polls are counted. What may come between: a read of everything
 //! else that is due at the same moment; other watchdogs and heartbeats; and of a device that has just fallen
 //! silent the wait for its answer, as long again in which the line is left alone, and a round of everything
-//! else that has become due meanwhile. Commands are not counted: they put a feeding off until two thirds of the
+//! else that has become due meanwhile. Before a poll that may be once for each read of the silent device, since all
+//! of them may be due for longer. Commands are not counted: they put a feeding off until two thirds of the
 //! time have passed, and no further.
 
 use serde::Serialize;
 
 use super::budget::Budget;
 use super::{advice, told};
+use crate::engine::bus::FAILURES_UNTIL_OFFLINE;
 use crate::engine::codec;
 use crate::engine::device::{Point, PointIndex};
 use crate::engine::plan::Cost;
@@ -40,6 +42,8 @@ pub struct Delays {
     /// A request that nobody answers, the silence after it, and what is left of the silence after the one
     /// before it.
     one_silent: f64,
+    /// The same for all that may be asked of such a device before a poll of this one.
+    all_silent: f64,
     /// The response timeout, and whether a line is left alone for as long again.
     timeout: f64,
     is_line: bool,
@@ -59,13 +63,18 @@ impl Delays {
         let demanded = settings.device.wire.response_timeout.unwrap_or_default();
         let timeout = bus.response_timeout.max(demanded).as_secs_f64();
         let is_line = bus.link.line().is_some();
+        let one_silent = (budget.one_silent + repeated(timeout, is_line)).max(budget.longest());
+        let reads = (0..budget.wants.len()).filter(|other| *other != device);
+        let reads = reads.map(|other| budget.asked_again_and_again(other)).max().unwrap_or_default();
+        let all_silent = all_silent(budget, reads, timeout, is_line).max(one_silent);
         Delays {
             asked_every,
             one_request: budget.longest(),
             round: budget.round(),
             others_fed: others.map(|(_, wants)| fed(wants)).sum(),
             own_beats: budget.wants[device].time_of_beats(),
-            one_silent: (budget.one_silent + repeated(timeout, is_line)).max(budget.longest()),
+            one_silent,
+            all_silent,
             timeout,
             is_line,
         }
@@ -92,6 +101,19 @@ const REPEATED_AFTER: f64 = 0.24;
 /// and wait for the rest of that; what is due meanwhile comes after it.
 fn repeated(timeout: f64, is_line: bool) -> f64 {
     if is_line { (timeout - REPEATED_AFTER).max(0.0) } else { 0.0 }
+}
+
+/// What a device that has just fallen silent keeps the bus before a poll of another one: each of its `reads` may
+/// have been due for longer, and be asked in vain until the device counts as offline. Not where the others find the
+/// time between two of them.
+fn all_silent(budget: &Budget, reads: usize, timeout: f64, is_line: bool) -> f64 {
+    let left_alone = if is_line { timeout } else { 0.0 };
+    let most = f64::from(FAILURES_UNTIL_OFFLINE);
+    let asked = match budget.longest() + budget.round() <= REPEATED_AFTER - left_alone {
+        true => 1.0,
+        false => (reads as f64).clamp(1.0, most),
+    };
+    (asked * budget.one_silent + repeated(timeout, is_line)).min(most * budget.one_silent)
 }
 
 /// A response timeout that no device should be offered less than.
@@ -128,7 +150,7 @@ pub fn of_device(settings: &DeviceSettings, delays: Delays) -> Vec<Feeding> {
         // is silent among that.
         let asked_every = delays.asked_every.unwrap_or(f64::INFINITY);
         let polled_every = asked_every + delays.one_request + delays.round;
-        let polled_every_one_silent = polled_every + delays.one_silent;
+        let polled_every_one_silent = polled_every + delays.all_silent;
         let [before, before_one_silent] =
             [delays.one_request, delays.one_silent].map(|delay| delay + delays.others_fed);
         let every = [polled_every.min(due + before), polled_every_one_silent.min(due + before_one_silent)];

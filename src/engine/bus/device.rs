@@ -43,6 +43,7 @@ use beats::Beats;
 pub(super) use beats::Need;
 use keeping::Keeping;
 use obeying::Retained;
+pub use patience::FAILURES_UNTIL_OFFLINE;
 use patience::Patience;
 use telling::Told;
 use turnaround::Turnaround;

@@ -50,6 +50,7 @@ pub use commands::STOPPING;
 use commands::{Active, Settling};
 use context::Context;
 pub use context::Telling;
+pub use device::FAILURES_UNTIL_OFFLINE;
 use device::{DeviceState, Turn};
 use devices::Devices;
 use fetch::Fetch;

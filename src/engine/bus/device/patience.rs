@@ -4,7 +4,7 @@ use super::super::line::at_random;
 use crate::engine::time::{Duration, Time};
 
 /// So many requests in a row without an answer, and a device counts as offline.
-pub(super) const FAILURES_UNTIL_OFFLINE: u32 = 3;
+pub const FAILURES_UNTIL_OFFLINE: u32 = 3;
 /// The longest pause between two attempts: with the attempt itself, what a device's return may take to
 /// be noticed is 15 seconds.
 const PAUSE_LONGEST: Duration = Duration::from_millis(14_200);
