@@ -235,8 +235,7 @@ impl Interview {
     /// Why nothing was heard, and where to look.
     pub fn why_unheard(&self) -> String {
         let error = self.objects_error.as_ref().unwrap_or(&RequestError::Timeout);
-        let remedy = error.what_to_check().map_or_else(String::new, |remedy| format!("; {remedy}"));
-        format!("{error}{remedy}")
+        format!("{error}{}", error.advice())
     }
 
     /// The objects by their names, as programs are told them.

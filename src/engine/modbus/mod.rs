@@ -181,7 +181,7 @@ impl RequestError {
     }
 
     /// Where to look when it comes again and again: each has other causes.
-    pub const fn what_to_check(&self) -> Option<&'static str> {
+    const fn what_to_check(&self) -> Option<&'static str> {
         match self {
             RequestError::Timeout => Some("check its power, its wiring and its unit"),
             RequestError::Unreachable(_) => Some("check the device behind the gateway"),
