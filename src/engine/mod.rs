@@ -22,6 +22,7 @@ pub mod yaml;
 
 // Ask: requests, replies, which come when, and what was last on the wire.
 pub mod modbus;
+pub mod pace;
 pub mod plan;
 pub mod recorder;
 pub mod schedule;

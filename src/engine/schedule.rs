@@ -1,13 +1,15 @@
 //! Which read of a bus is next: the one that is furthest past its period.
 //!
-//! Urgency is the time since a read last began, divided by its period. On a bus that cannot keep up
-//! every period stretches by about the same factor ([`Pace`]), and nothing starves. Reads that are wanted at
-//! once (after a connect, after a write, on request) come before all of them, selectors first.
+//! Urgency is the time since a read had its turn, divided by its period: in the time of the bus ([`Pace`]), which goes
+//! slower than the clock where the bus cannot keep up, so that every period stretches by the same factor and nothing
+//! starves. Reads that are wanted at once (after a connect, after a write, on request) come before all of them,
+//! selectors first.
 
 use std::sync::Arc;
 
 use crate::engine::address::{Address, Span};
 use crate::engine::device::{Intervals, PointIndex, Poll};
+use crate::engine::pace::{Moment, Pace};
 use crate::engine::plan::Read;
 use crate::engine::time::{Duration, Time};
 
@@ -24,14 +26,15 @@ struct Planned {
     period: Option<Duration>,
     /// Some point in it decides how others are read.
     has_selector: bool,
+    /// Since when it counts its period, in the time of the bus.
     began_at: Option<Time>,
-    /// The same without the shift that keeps the period on average.
+    /// When it was last sent.
     sent_at: Option<Time>,
-    /// How long after the one before it the last read began by its period.
+    /// How long after the one before it a read began by its period, on average of the last few.
     real_period: Option<Duration>,
     wanted_now: bool,
-    /// Has been asked in vain, and is due again whatever its period says.
-    is_repeated: bool,
+    /// Has been asked in vain until then, and is due again whatever its period says.
+    failed_at: Option<Time>,
     /// How often it has been answered since the device connected, as far as that is counted.
     answers: u8,
     /// Has been answered as it stands, be it before the device was away.
@@ -51,87 +54,31 @@ struct Planned {
 /// its turn comes nevertheless.
 const REPEATED_BEHIND: Duration = Duration::from_secs(2);
 
+/// So many of its periods a read may be behind in the time of the bus; with its turn it is then two periods or so
+/// since it had the one before.
+const BEHIND_MOST: u32 = 2;
+
 /// A read that comes at least so often, and has been answered so often since its device connected, holds no
 /// surprise any more. After one that was not answered it takes a few more.
 const PERIOD_WELL_KNOWN: Duration = Duration::from_secs(10);
 const ANSWERS_WELL_KNOWN: u8 = 32;
 const ANSWERS_TO_FORGIVE: u8 = 8;
 
-/// Where a read stands in the schedule.
+/// Where a read stood in the schedule before it began.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Place {
     began_at: Option<Time>,
     wanted_now: bool,
-    is_repeated: bool,
-}
-
-/// How a bus as a whole keeps up with the periods that are wanted of it.
-#[derive(Clone, Copy, Debug)]
-pub struct Pace {
-    /// When nothing was due.
-    idle_at: Option<Time>,
-    /// By how much periods are longer than they should be, on average.
-    stretch: f64,
-}
-
-impl Default for Pace {
-    fn default() -> Pace {
-        Pace { idle_at: None, stretch: 1.0 }
-    }
-}
-
-impl Pace {
-    /// Each turn moves the average by this part of itself.
-    const STEP: f64 = 1.0 / 32.0;
-    /// Less than this is what comes and goes on a bus that keeps up.
-    const BEHIND: f64 = 1.1;
-
-    /// Nothing is due.
-    pub fn idle(&mut self, now: Time) {
-        self.idle_at = Some(now);
-    }
-
-    /// By how much periods are longer than they should be, on average.
-    pub fn stretch(&self) -> f64 {
-        self.stretch
-    }
-
-    /// Whether periods are longer than they should be, and there was no moment within this time when nothing was due.
-    pub fn is_behind(&self, now: Time, time: Duration) -> bool {
-        self.stretch > Pace::BEHIND && self.idle_at.is_none_or(|idle_at| now - idle_at > time)
-    }
-
-    /// From when on a read that begins now counts its next period.
-    fn keep(
-        &mut self,
-        now: Time,
-        began_at: Time,
-        sent_at: Option<Time>,
-        period: Duration,
-        real: Duration,
-    ) -> Time {
-        let stretch = real.as_secs_f64() / period.as_secs_f64().max(1e-6);
-        self.stretch = (self.stretch + (stretch - self.stretch) * Pace::STEP).max(1.0);
-        let is_caught_up =
-            self.idle_at.is_some_and(|idle_at| sent_at.is_none_or(|sent_at| idle_at >= sent_at));
-        let due = began_at + period;
-        if is_caught_up {
-            // A read that begins a little late does not shift those after it: the period is kept on average.
-            return if due <= now && now - due < period { due } else { now };
-        }
-        // There is no time to spare. What waits longest in relation to its period goes first, but whoever
-        // has a short one waits now and then much longer than usual, and makes up for it: so each counts on
-        // with the bus's stretch, and not from when it had its turn.
-        let fair = began_at + period.mul_f64(self.stretch);
-        if now - fair >= period * 2 {
-            // After a standstill nothing is made up for.
-            return now;
-        }
-        fair.max(Time(now.0.saturating_sub(period.as_micros() as u64))).min(now + period)
-    }
+    failed_at: Option<Time>,
+    was_due: bool,
 }
 
 impl Place {
+    /// Its period was over, and that is why it began.
+    pub fn was_in_turn(&self) -> bool {
+        self.was_due
+    }
+
     /// It was wanted at once, and not because its period was over.
     pub fn was_wanted(&self) -> bool {
         self.wanted_now
@@ -141,8 +88,8 @@ impl Place {
 /// How much a read is wanted; the greatest is next.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub enum Urgency {
-    /// Time since it last began ÷ its period; less than 1 where it has had its share of a bus that cannot keep
-    /// up, and goes only because nothing else is due.
+    /// Time since it had its turn ÷ its period, in the time of the bus. Less than 1 where it is not due by that, and
+    /// goes because nothing else is.
     Overdue(f64),
     Wanted,
     WantedSelector,
@@ -155,6 +102,8 @@ pub struct Outlook {
     pub not_before: Time,
     /// `None`: it has to be looked at.
     pub reads: Option<ByPeriod>,
+    /// How many reads a second it wants.
+    pub wanted: f64,
 }
 
 /// Of the fast and of the slow reads, the one that has waited longest.
@@ -163,23 +112,33 @@ pub type ByPeriod = [Option<Waiting>; 2];
 /// What a read waits for that is wanted by its period.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Waiting {
-    /// From when on it counts its period; ahead of now where it has had more than its share of a bus that cannot
-    /// keep up.
+    /// Since when it counts its period, in the time of the bus.
     began_at: Time,
-    /// When it last really began, if that is known.
+    /// When it was last sent, if that is known.
     sent_at: Option<Time>,
     period: Duration,
 }
 
 impl Waiting {
-    /// A period after it was sent at the latest: on a bus where nothing else is due it waits for no more.
-    fn due_at(&self) -> Time {
-        self.sent_at.map_or(self.began_at, |sent_at| sent_at.min(self.began_at)) + self.period
+    /// By the time of the bus.
+    fn due(&self) -> Time {
+        self.began_at + self.period
+    }
+
+    /// By the clock, if the bus has nothing to do until then: on a bus where nothing else is due it waits for no more
+    /// than its period.
+    fn due_at(&self, at: Moment) -> Time {
+        let by_turns = at.now + (self.due() - at.until);
+        self.sent_at.map_or(by_turns, |sent_at| by_turns.min(sent_at + self.period))
     }
 
     /// `None`: it is not due.
-    fn urgency(&self, now: Time) -> Option<f64> {
-        (now >= self.due_at()).then(|| periods(now - self.began_at, self.period))
+    fn urgency(&self, at: Moment) -> Option<f64> {
+        if at.turns >= self.due() {
+            return Some(periods(at.turns - self.began_at, self.period));
+        }
+        // What is due first goes first.
+        (self.due_at(at) <= at.now).then(|| 1.0 / (1.0 + (self.due() - at.turns).as_secs_f64()))
     }
 
     /// What is as urgent as either of them at any time, or more.
@@ -194,12 +153,12 @@ impl Waiting {
 
 impl Outlook {
     /// `None`: nothing is due.
-    pub fn at_most(&self, now: Time) -> Option<Urgency> {
-        if now < self.not_before {
+    pub fn at_most(&self, at: Moment) -> Option<Urgency> {
+        if at.now < self.not_before {
             return None;
         }
         let Some(reads) = &self.reads else { return Some(Urgency::WantedSelector) };
-        let overdue = reads.iter().flatten().filter_map(|waiting| waiting.urgency(now));
+        let overdue = reads.iter().flatten().filter_map(|waiting| waiting.urgency(at));
         overdue.reduce(f64::max).map(Urgency::Overdue)
     }
 }
@@ -224,7 +183,7 @@ impl Polls {
             sent_at: None,
             real_period: None,
             wanted_now: true,
-            is_repeated: false,
+            failed_at: None,
             answers: 0,
             was_given: false,
             tried: false,
@@ -258,10 +217,10 @@ impl Polls {
     }
 
     /// The most urgent read that may begin now.
-    pub fn most_urgent(&self, now: Time) -> Option<(usize, Urgency)> {
+    pub fn most_urgent(&self, at: Moment) -> Option<(usize, Urgency)> {
         let mut best: Option<(usize, Urgency)> = None;
         for (index, planned) in self.reads.iter().enumerate() {
-            let Some(urgency) = planned.urgency(now) else { continue };
+            let Some(urgency) = planned.urgency(at) else { continue };
             if best.is_none_or(|(_, greatest)| urgency > greatest) {
                 best = Some((index, urgency));
             }
@@ -273,7 +232,7 @@ impl Polls {
     pub fn by_period(&self, now: Time) -> Option<ByPeriod> {
         let mut oldest: ByPeriod = [None; 2];
         for planned in self.reads.iter().filter(|planned| !planned.sleeps) {
-            if planned.wanted_now || planned.is_repeated || now < planned.paused_until {
+            if planned.wanted_now || planned.failed_at.is_some() || now < planned.paused_until {
                 return None;
             }
             if let Some(waiting) = planned.waiting() {
@@ -286,9 +245,9 @@ impl Polls {
 
     /// The read that has waited longest among those that may begin now, whether it is wanted at once or
     /// not, and for how many of its periods.
-    pub fn longest_waiting(&self, now: Time) -> Option<(usize, f64)> {
+    pub fn longest_waiting(&self, at: Moment) -> Option<(usize, f64)> {
         let waiting = self.reads.iter().enumerate();
-        let waiting = waiting.filter_map(|(index, planned)| Some((index, planned.waited(now)?)));
+        let waiting = waiting.filter_map(|(index, planned)| Some((index, planned.waited(at)?)));
         waiting.reduce(|best, other| if other.1 > best.1 { other } else { best })
     }
 
@@ -308,31 +267,62 @@ impl Polls {
     }
 
     /// When the next read will be due, if nothing asks for one before.
-    pub fn due_at(&self) -> Option<Time> {
-        self.reads.iter().filter_map(Planned::due_at).min()
+    pub fn due_at(&self, at: Moment) -> Option<Time> {
+        self.reads.iter().filter_map(|planned| planned.due_at(at)).min()
+    }
+
+    /// How many reads a second are wanted by their periods.
+    pub fn wanted(&self) -> f64 {
+        self.filled(|_| Duration::from_secs(1))
     }
 
     /// The read is being sent; returns where it stood before. `pace` is that of the
     /// whole bus.
     pub fn begin(&mut self, index: usize, now: Time, pace: &mut Pace) -> Place {
+        let (at, lets_ahead) = (pace.at(now), pace.lets_ahead());
         let planned = &mut self.reads[index];
-        let (began_at, wanted_now, is_repeated) = (planned.began_at, planned.wanted_now, planned.is_repeated);
-        let before = Place { began_at, wanted_now, is_repeated };
-        let is_in_turn = !wanted_now && !is_repeated;
-        planned.began_at = match (planned.began_at, planned.period) {
-            (Some(began_at), Some(period)) if is_in_turn => {
-                let real = planned.sent_at.map_or(period, |sent_at| now - sent_at);
-                Some(pace.keep(now, began_at, planned.sent_at, period, real))
+        let (began_at, wanted_now, failed_at) = (planned.began_at, planned.wanted_now, planned.failed_at);
+        let is_for_period = !wanted_now && failed_at.is_none();
+        // Whoever feeds a watchdog does not wait until it is due.
+        let has_turn = |urgency| urgency >= 1.0 || lets_ahead;
+        let in_turn =
+            planned.waiting().filter(|waiting| is_for_period && waiting.urgency(at).is_some_and(has_turn));
+        let last = planned.sent_at.map(|sent_at| now - sent_at);
+        planned.began_at = match in_turn {
+            Some(waiting) => {
+                let stretch = last.map_or(1.0, |last| periods(last, waiting.period));
+                Some(pace.begin_turn(now, waiting.due(), waiting.period, stretch))
             }
-            _ => Some(now),
+            None => Some(pace.begin(now, planned.period)),
         };
-        // A read that was wanted out of turn says nothing about the turns.
-        if is_in_turn {
-            planned.real_period = planned.sent_at.map(|sent_at| now - sent_at);
+        // A read that was wanted out of turn says nothing about the turns. One that was kept waiting is followed by one
+        // that makes up for it.
+        if is_for_period {
+            planned.real_period =
+                last.map(|last| planned.real_period.map_or(last, |mean| (mean * 3 + last) / 4));
         }
         planned.sent_at = Some(now);
-        (planned.wanted_now, planned.is_repeated) = (false, false);
-        before
+        (planned.wanted_now, planned.failed_at) = (false, None);
+        self.let_go(index, pace.at(now).turns);
+        Place { began_at, wanted_now, failed_at, was_due: in_turn.is_some() }
+    }
+
+    /// What keeps a device behind the others for longer than [`BEHIND_MOST`] is its own affair, such as the silence
+    /// that it wants, and is not made up for. All of its reads are put off alike, which leaves each its share.
+    fn let_go(&mut self, index: usize, turns: Time) {
+        let planned = &self.reads[index];
+        let (Some(began_at), Some(period)) = (planned.began_at, planned.period) else { return };
+        let too_much = (turns - began_at).saturating_sub(period * BEHIND_MOST);
+        if !too_much.is_zero() {
+            let of_all = self.reads.iter_mut().filter_map(|planned| planned.began_at.as_mut());
+            of_all.for_each(|at| *at = (*at + too_much).min(turns).max(*at));
+        }
+    }
+
+    /// The device turned out to be there by answering the read.
+    pub fn began(&mut self, index: usize, sent_at: Time) {
+        let planned = &mut self.reads[index];
+        (planned.sent_at, planned.wanted_now) = (Some(sent_at), false);
     }
 
     /// The read was not sent after all.
@@ -340,7 +330,7 @@ impl Polls {
         let planned = &mut self.reads[index];
         planned.began_at = before.began_at;
         planned.wanted_now |= before.wanted_now;
-        planned.is_repeated |= before.is_repeated;
+        planned.failed_at = planned.failed_at.or(before.failed_at);
     }
 
     /// The poll class's period as the bus keeps it now: that of the slowest of its reads, a read that
@@ -406,7 +396,7 @@ impl Polls {
         let planned = &mut self.reads[index];
         planned.answers = planned.answers.min(ANSWERS_WELL_KNOWN - ANSWERS_TO_FORGIVE);
         if planned.period.is_some() && planned.tried && !goes_first {
-            (planned.is_repeated, planned.began_at) = (true, Some(now));
+            planned.failed_at = Some(now);
         } else {
             planned.wanted_now = true;
         }
@@ -447,7 +437,7 @@ impl Polls {
     pub fn want_all(&mut self) {
         for planned in &mut self.reads {
             planned.wanted_now = true;
-            planned.is_repeated = false;
+            planned.failed_at = None;
             planned.answers = 0;
             planned.tried = false;
             planned.paused_until = Time::default();
@@ -507,7 +497,7 @@ impl Polls {
                 planned.sent_at = before.sent_at;
                 planned.real_period = before.real_period;
                 planned.wanted_now = before.wanted_now;
-                planned.is_repeated = before.is_repeated;
+                planned.failed_at = before.failed_at;
                 planned.answers = before.answers;
                 planned.was_given = before.was_given;
                 planned.tried = before.tried;
@@ -527,47 +517,51 @@ impl Planned {
         self.sent_at = first(|planned| planned.sent_at);
         self.real_period = before.iter().filter_map(|planned| planned.real_period).max();
         self.wanted_now = before.iter().any(|planned| planned.wanted_now);
-        self.is_repeated = before.iter().any(|planned| planned.is_repeated);
+        self.failed_at = first(|planned| planned.failed_at);
         self.tried = before.iter().all(|planned| planned.tried);
         self.is_refused = before.iter().any(|planned| planned.is_refused);
         self.paused_until = before.iter().map(|planned| planned.paused_until).min().unwrap_or_default();
     }
 
-    fn urgency(&self, now: Time) -> Option<Urgency> {
-        if now < self.paused_until || self.sleeps {
+    fn urgency(&self, at: Moment) -> Option<Urgency> {
+        if at.now < self.paused_until || self.sleeps {
             return None;
         }
         if self.wanted_now {
             return Some(if self.has_selector { Urgency::WantedSelector } else { Urgency::Wanted });
         }
         let waiting = self.waiting()?;
-        if self.is_repeated {
-            let waited = (now - waiting.began_at).saturating_sub(REPEATED_BEHIND);
+        if let Some(failed_at) = self.failed_at {
+            let waited = (at.now - failed_at).saturating_sub(REPEATED_BEHIND);
             return Some(Urgency::Overdue(periods(waited, waiting.period)));
         }
-        waiting.urgency(now).map(Urgency::Overdue)
+        waiting.urgency(at).map(Urgency::Overdue)
     }
 
     fn waiting(&self) -> Option<Waiting> {
         Some(Waiting { began_at: self.began_at?, sent_at: self.sent_at, period: self.period? })
     }
 
-    /// For how many of its periods it has waited. What has no period and is wanted counts in tens of seconds,
-    /// and comes first when it has never been read.
-    fn waited(&self, now: Time) -> Option<f64> {
+    /// For how many of its periods it has waited, if that is enough. What has no period and is wanted counts in tens of
+    /// seconds, and comes first when it has never been read.
+    fn waited(&self, at: Moment) -> Option<f64> {
         const NO_PERIOD: Duration = Duration::from_secs(10);
-        self.urgency(now)?;
-        let Some(began_at) = self.began_at else { return Some(f64::INFINITY) };
-        let waited = periods(now - began_at, self.period.unwrap_or(NO_PERIOD));
-        (waited >= 1.0).then_some(waited)
+        match self.urgency(at)? {
+            Urgency::Overdue(waited) => Some(waited),
+            Urgency::Wanted | Urgency::WantedSelector => {
+                let Some(began_at) = self.began_at else { return Some(f64::INFINITY) };
+                let waited = periods(at.turns - began_at, self.period.unwrap_or(NO_PERIOD));
+                (waited >= 1.0).then_some(waited)
+            }
+        }
     }
 
-    fn due_at(&self) -> Option<Time> {
+    fn due_at(&self, at: Moment) -> Option<Time> {
         if self.sleeps {
             return None;
         }
-        let due =
-            if self.wanted_now || self.is_repeated { Time::default() } else { self.waiting()?.due_at() };
+        let is_due = self.wanted_now || self.failed_at.is_some();
+        let due = if is_due { Time::default() } else { self.waiting()?.due_at(at) };
         Some(due.max(self.paused_until))
     }
 }

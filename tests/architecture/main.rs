@@ -20,7 +20,7 @@ const ENGINE_ORDER: &[&[&str]] = &[
         "wanted",
         "configuration",
     ],
-    &["modbus", "recorder", "plan", "schedule"],
+    &["modbus", "recorder", "plan", "pace", "schedule"],
     &["identity", "scan", "line_change", "state"],
     &["topics", "health", "feed", "homeassistant", "outbox", "connection"],
     &["members", "transaction", "command", "memory", "upkeep", "arrivals", "request", "bus", "reload"],

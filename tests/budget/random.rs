@@ -144,12 +144,48 @@ fn faults_of(seed: u64) -> Vec<String> {
         told += 1;
     }
     assert!(told > 0, "seed {seed} shows nothing");
+    if load > OVERLOADED {
+        faults.extend(fault_of_stretches(seed, &configuration, &forecast, &wire, &counts));
+    }
     let feeding = &forecast["devices"][usize::from(units)]["feeding"][0];
     if feeding.is_object() {
         faults.extend(faults_of_feeding(seed, units, feeding, &mut wire));
     }
     faults
 }
+
+/// All periods are stretched by the same factor, but for those of units that want silence: how long that makes them
+/// wait, they decide themselves.
+fn fault_of_stretches(
+    seed: u64,
+    configuration: &str,
+    forecast: &Json,
+    wire: &Wire,
+    counts: &BTreeMap<(u8, u16), usize>,
+) -> Option<String> {
+    let rests = |unit: u8| {
+        let unit = format!("  unit_{unit}:");
+        !configuration.lines().any(|line| line.starts_with(&unit) && line.contains("delay: 0ms"))
+    };
+    let stretch = |unit: u8, address: u16, found: f64| {
+        let class = if address >= SLOW_FROM { "slow" } else { "fast" };
+        found
+            / forecast["devices"][usize::from(unit) - 1]["polls"][class]["period"].as_f64().expect("a period")
+    };
+    let periods = wire.periods().into_iter();
+    let counted =
+        periods.filter(|(read, _)| counts[read] >= ROUNDS_OF_STRETCH && read.0 != RELAYS && !rests(read.0));
+    let stretches: Vec<f64> = counted.map(|((unit, address), found)| stretch(unit, address, found)).collect();
+    let least = stretches.iter().copied().fold(f64::MAX, f64::min);
+    let most = stretches.iter().copied().fold(0.0, f64::max);
+    println!("seed {seed}: {} reads, stretched by {least:.3} to {most:.3}", stretches.len());
+    (most > least * (1.0 + WITHIN)).then(|| format!("seed {seed}: stretched by {stretches:.3?}"))
+}
+
+/// Where the load is said to be more than this every period is longer than it should be.
+const OVERLOADED: f64 = 1.05;
+/// What waits for a long request of others has no mean to speak of after a few rounds.
+const ROUNDS_OF_STRETCH: usize = 40;
 
 /// The watchdog waits no longer than is forecast, but nearly as long: while all answer, and while one unit after the other
 /// dies, at moments that keep no step with the relays' polls, and returns.

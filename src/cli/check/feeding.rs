@@ -32,6 +32,9 @@ const LONGER: f64 = HEARTBEATS_WITHIN / (HEARTBEATS_WITHIN - 1.0);
 pub struct Delays {
     /// The longest time between two requests to this device; none where nothing is polled.
     asked_every: Option<f64>,
+    /// The longest that was seen to pass between two, where the bus cannot keep up: there a round of everything else
+    /// between two polls is not the most.
+    pub waited_for: f64,
     /// The request that is on the wire when something comes; and all that is read again and again, once.
     one_request: f64,
     round: f64,
@@ -69,6 +72,7 @@ impl Delays {
         let all_silent = all_silent(budget, reads, timeout, is_line).max(one_silent);
         Delays {
             asked_every,
+            waited_for: 0.0,
             one_request: budget.longest(),
             round: budget.round(),
             others_fed: others.map(|(_, wants)| fed(wants)).sum(),
@@ -149,8 +153,10 @@ pub fn of_device(settings: &DeviceSettings, delays: Delays) -> Vec<Feeding> {
         // Otherwise one may be on the wire and everything else be due when it is due, and the device that
         // is silent among that.
         let asked_every = delays.asked_every.unwrap_or(f64::INFINITY);
-        let polled_every = asked_every + delays.one_request + delays.round;
-        let polled_every_one_silent = polled_every + delays.all_silent;
+        let polled_every = (asked_every + delays.round).max(delays.waited_for) + delays.one_request;
+        // Behind a silence there may be such a round as well.
+        let uneven = asked_every.max(delays.waited_for) + delays.round + delays.one_request;
+        let polled_every_one_silent = uneven + delays.all_silent;
         let [before, before_one_silent] =
             [delays.one_request, delays.one_silent].map(|delay| delay + delays.others_fed);
         let every = [polled_every.min(due + before), polled_every_one_silent.min(due + before_one_silent)];

@@ -34,6 +34,8 @@ pub struct Forecast {
     pub load: f64,
     /// By device and class: how often it is really read, where that is told.
     periods: BTreeMap<(usize, Poll), f64>,
+    /// By device: the longest time from one request to the next that was seen.
+    waits: Vec<f64>,
 }
 
 impl Forecast {
@@ -54,6 +56,12 @@ impl Forecast {
     pub fn real_period(&self, device: usize, poll: Poll, wanted: f64) -> f64 {
         // What comes round too seldom to be counted is stretched as everything is.
         self.periods.get(&(device, poll)).copied().unwrap_or(wanted * self.load.max(1.0))
+    }
+
+    /// The longest time from one request to this device to the next, as far as it was seen, where the bus cannot keep
+    /// up: how unevenly a read has its turns there no sum tells.
+    pub fn waits_unevenly(&self, device: usize) -> f64 {
+        if self.load > 1.0 { self.waits[device] } else { 0.0 }
     }
 }
 
@@ -86,6 +94,11 @@ fn count(rehearsal: &mut Rehearsal, devices: &[&DeviceSettings], budget: &Budget
     }
     let share = (rehearsal.busy - busy).as_secs_f64() / (rehearsal.now - begin).as_secs_f64();
 
+    let wait = |device: &&DeviceSettings| {
+        let times = || rehearsal.asked.iter().filter(|asked| asked.unit == device.unit).map(|asked| asked.at);
+        times().zip(times().skip(1)).map(|(one, next)| (next - one).as_secs_f64()).fold(0.0, f64::max)
+    };
+    let waits = devices.iter().map(wait).collect();
     let mut times: BTreeMap<(u8, Span), Seen> = BTreeMap::new();
     for asked in rehearsal.asked.drain(..) {
         if let Call::Read(span) = asked.call {
@@ -106,7 +119,7 @@ fn count(rehearsal: &mut Rehearsal, devices: &[&DeviceSettings], budget: &Budget
         *of_class = of_class.max(*real);
     }
     let load = if share > NEVER_DONE { stretch(&told).max(share) } else { share };
-    Forecast { load, periods }
+    Forecast { load, periods, waits }
 }
 
 /// By how much the periods are longer than they should be: those of devices that want silence may be so for that alone,

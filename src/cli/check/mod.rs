@@ -267,7 +267,8 @@ impl BusSummary {
                 poll.seconds += read.time;
             }
             let periods = polls.values().filter_map(|poll| poll.real_period);
-            let asked_every = periods.reduce(f64::min);
+            let mut delays = Delays::of(bus, settings, number, periods.reduce(f64::min), &budget);
+            delays.waited_for = forecast.waits_unevenly(number);
             DeviceSummary {
                 name: settings.name.clone(),
                 title: settings.title.clone(),
@@ -275,10 +276,7 @@ impl BusSummary {
                 unit: settings.unit,
                 points: settings.device.points.len(),
                 polls,
-                feeding: feeding::of_device(
-                    settings,
-                    Delays::of(bus, settings, number, asked_every, &budget),
-                ),
+                feeding: feeding::of_device(settings, delays),
             }
         };
         BusSummary {

@@ -29,7 +29,7 @@ use crate::engine::address::Span;
 use crate::engine::device::{Device, Point, PointIndex};
 use crate::engine::health::Counters;
 use crate::engine::plan::{self, Read, Tariff};
-use crate::engine::schedule::{Pace, Polls};
+use crate::engine::schedule::Polls;
 use crate::engine::settings::{DeviceSettings, Eeprom};
 use crate::engine::state::Values;
 use crate::engine::time::{Duration, Time};
@@ -63,8 +63,6 @@ pub(super) struct DeviceState {
     pub(super) idle_rest: Duration,
     turnaround: Turnaround,
     polls: Polls,
-    /// How it keeps up with its periods, where it wants more silence than they leave it: never.
-    own_pace: Pace,
     /// What the device has refused to give in one answer.
     refused: Vec<Span>,
     withheld: Withheld,
@@ -123,7 +121,6 @@ impl DeviceState {
             idle_rest,
             turnaround,
             polls,
-            own_pace: Pace::default(),
             refused: Vec::new(),
             withheld: Withheld::default(),
             patience: Patience::default(),

@@ -5,6 +5,7 @@
 
 use std::ops::{Deref, DerefMut, Index, IndexMut};
 
+use crate::engine::pace::{Moment, Pace};
 use crate::engine::schedule::{Outlook, Urgency};
 use crate::engine::time::Time;
 
@@ -27,15 +28,22 @@ pub(super) struct Next {
 impl Devices {
     /// What is most urgent of all devices that may be asked. Of two equally urgent ones, that which has waited
     /// longest.
-    pub(super) fn most_urgent(&mut self, now: Time, may_ask: impl Fn(&DeviceState) -> bool) -> Option<Next> {
+    pub(super) fn most_urgent(
+        &mut self,
+        now: Time,
+        pace: &mut Pace,
+        may_ask: impl Fn(&DeviceState) -> bool,
+    ) -> Option<Next> {
+        let (at, mut wanted) = (pace.at(now), 0.0);
         let mut best: Option<Next> = None;
         for (index, (device, outlook)) in self.list.iter().zip(&mut self.outlooks).enumerate() {
             let outlook = outlook.get_or_insert_with(|| device.outlook(now));
-            let Some(at_most) = outlook.at_most(now) else { continue };
+            wanted += outlook.wanted;
+            let Some(at_most) = outlook.at_most(at) else { continue };
             if best.as_ref().is_some_and(|best| at_most < best.urgency) || !may_ask(device) {
                 continue;
             }
-            let Some((polled, urgency)) = device.most_urgent(now) else { continue };
+            let Some((polled, urgency)) = device.most_urgent(at) else { continue };
             let is_better = best.as_ref().is_none_or(|best| {
                 let waited_longer = device.served_at() < self.list[best.device].served_at();
                 urgency > best.urgency || (urgency == best.urgency && waited_longer)
@@ -46,20 +54,22 @@ impl Devices {
         }
         debug_assert_eq!(
             best.as_ref().map(|best| (best.device, best.urgency)),
-            self.most_urgent_by_looking(now, may_ask),
+            self.most_urgent_by_looking(at, may_ask),
             "what is known of the devices is not what they want"
         );
+        let is_ahead = |next: &Next| matches!(next.urgency, Urgency::Overdue(periods) if periods < 1.0);
+        pace.want(wanted, best.as_ref().is_some_and(is_ahead));
         best
     }
 
     /// The same by a look at everything, which any test of a bus holds the short way against.
     fn most_urgent_by_looking(
         &self,
-        now: Time,
+        at: Moment,
         may_ask: impl Fn(&DeviceState) -> bool,
     ) -> Option<(usize, Urgency)> {
         let askable = self.iter().enumerate().filter(|(_, device)| may_ask(device));
-        let urgent = askable.filter_map(|(index, device)| Some((index, device.most_urgent(now)?.1)));
+        let urgent = askable.filter_map(|(index, device)| Some((index, device.most_urgent(at)?.1)));
         urgent.reduce(|best, other| {
             let waited_longer = || self[other.0].served_at() < self[best.0].served_at();
             let is_better = other.1 > best.1 || (other.1 == best.1 && waited_longer());

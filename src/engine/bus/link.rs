@@ -68,6 +68,7 @@ impl Bus {
         let delays = self.devices.iter().map(|device| device.device().wire.connect_delay);
         self.silent_until = self.now + delays.max().unwrap_or_default();
         self.record_note("the link is up");
+        self.pace.idle(self.now);
         (self.connection.up_at, self.connection.answers) = (self.now, 0);
         match std::mem::replace(&mut self.link_state, LinkState::Up) {
             // The devices are as silent as they were, and are asked as seldom.

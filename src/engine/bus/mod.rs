@@ -36,10 +36,10 @@ use crate::engine::device::PointIndex;
 use crate::engine::health::{BusReport, Counters};
 use crate::engine::memory::{Memories, Record};
 use crate::engine::modbus::{Answer, Call, Reply, Request, RequestError};
+use crate::engine::pace::Pace;
 use crate::engine::plan::Tariff;
 use crate::engine::recorder::Recording;
 use crate::engine::request;
-use crate::engine::schedule::Pace;
 use crate::engine::settings::{DeviceSettings, Link, OnBrokerLoss, Rules, Settings};
 use crate::engine::time::{Date, Duration, Time};
 use crate::engine::topics::Message;
@@ -360,7 +360,8 @@ impl Bus {
         if self.now < self.silent_until {
             return whatever_the_line_does.chain([self.silent_until]).min();
         }
-        let of_devices = self.askable().filter_map(|(_, device)| device.due_at());
+        let at = self.pace.at(self.now);
+        let of_devices = self.askable().filter_map(|(_, device)| device.due_at(at));
         let spared =
             self.waiting.iter().map(|waiting| self.devices[waiting.device].writable_at(waiting.target));
         let settings = self.devices.iter().filter_map(DeviceState::next_setting_at);
@@ -429,7 +430,7 @@ impl Bus {
     /// The request on the wire has ended: counts what is to be learnt about the line, and then sees to the answer.
     fn reply(&mut self, reply: Reply) {
         let Some(in_flight) = self.in_flight.take() else { return };
-        self.count_turn(&in_flight);
+        self.count_turn(&in_flight, &reply);
         self.record_reply(in_flight.device, &reply);
         self.counters.count_result(&reply.result);
         self.counters.count_discarded(reply.discarded);

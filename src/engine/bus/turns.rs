@@ -7,9 +7,9 @@
 //! [`FED_IN_A_ROW`].
 
 use crate::engine::address::Span;
-use crate::engine::modbus::{Call, Request};
+use crate::engine::modbus::{Call, Reply, Request, RequestError};
 use crate::engine::settings::Link;
-use crate::engine::time::Time;
+use crate::engine::time::{Duration, Time};
 
 use super::device::{DeviceState, Need, Polled};
 use super::devices::Next;
@@ -59,7 +59,7 @@ impl Bus {
             }
             let now = self.now;
             let runs_out = self.watchdogs_run_out();
-            let next = self.devices.most_urgent(now, |device| may_ask(device, runs_out));
+            let next = self.devices.most_urgent(now, &mut self.pace, |device| may_ask(device, runs_out));
             let read_before_setting = std::mem::take(&mut self.wrote_setting);
             let read_before_request = self.requests_go_on();
             let Some(Next { device, polled, .. }) = next else {
@@ -85,7 +85,13 @@ impl Bus {
     }
 
     /// A request has had its turn.
-    pub(super) fn count_turn(&mut self, ended: &InFlight) {
+    pub(super) fn count_turn(&mut self, ended: &InFlight, reply: &Reply) {
+        // In a silence all have waited, and behind what goes out of turn as well: nobody makes up for it.
+        let was_turn = ended.before.is_some_and(|before| before.was_in_turn());
+        if was_turn {
+            let is_silence = reply.result == Err(RequestError::Timeout);
+            self.pace.had_turn(if is_silence { Duration::ZERO } else { self.now - ended.decided_at });
+        }
         if ended.out_of_turn {
             self.ahead += 1;
         } else if matches!(ended.purpose, Purpose::Poll { .. }) {
@@ -99,9 +105,9 @@ impl Bus {
             return false;
         }
         self.ahead = 0;
-        let now = self.now;
+        let at = self.pace.at(self.now);
         let overdue = self.askable().filter_map(|(index, device)| {
-            let (polled, waited) = device.longest_waiting(now)?;
+            let (polled, waited) = device.longest_waiting(at)?;
             Some((index, polled, waited))
         });
         let longest = overdue.reduce(|best, other| if other.2 > best.2 { other } else { best });
@@ -218,7 +224,10 @@ impl Bus {
         let state = &mut self.devices[device];
         let before = match purpose {
             Purpose::Poll { read } => state.begin_read(read, self.now, &mut self.pace),
-            _ => state.turn(),
+            _ => {
+                self.pace.busy(self.now);
+                state.turn()
+            }
         };
         let is_poll = matches!(purpose, Purpose::Poll { .. });
         let is_wish = matches!(purpose, Purpose::Command | Purpose::Fetch | Purpose::BeatRead(_));
@@ -255,6 +264,7 @@ impl Bus {
     /// Asks a unit that is no device of this gateway.
     pub(super) fn send_stranger(&mut self, request: Request, purpose: Purpose) {
         let (now, timeout) = (self.now, self.response_timeout);
+        self.pace.busy(now);
         self.in_flight = Some(InFlight {
             device: None,
             purpose,

@@ -2,7 +2,8 @@
 
 use crate::engine::identity;
 use crate::engine::modbus::{Call, Request};
-use crate::engine::schedule::{Outlook, Pace, Place, Polls, Urgency};
+use crate::engine::pace::{Moment, Pace};
+use crate::engine::schedule::{Outlook, Place, Polls, Urgency};
 use crate::engine::time::{Duration, Time};
 
 use super::{DeviceState, Presence};
@@ -24,6 +25,11 @@ pub(in crate::engine::bus) struct Turn {
 }
 
 impl Turn {
+    /// It was asked because the period of a read was over.
+    pub(in crate::engine::bus) fn was_in_turn(&self) -> bool {
+        self.place.is_some_and(|place| place.was_in_turn())
+    }
+
     /// It was asked out of turn.
     pub(in crate::engine::bus) fn was_wanted(&self) -> bool {
         self.place.is_some_and(|place| place.was_wanted())
@@ -32,10 +38,10 @@ impl Turn {
 
 impl DeviceState {
     /// When it wants to be asked again.
-    pub(in crate::engine::bus) fn due_at(&self) -> Option<Time> {
+    pub(in crate::engine::bus) fn due_at(&self, at: Moment) -> Option<Time> {
         let rested = self.paused_until.max(self.rested_at());
         match self.presence {
-            Presence::Present => self.polls.due_at().map(|due| due.max(rested)),
+            Presence::Present => self.polls.due_at(at).map(|due| due.max(rested)),
             _ => Some(rested),
         }
     }
@@ -45,27 +51,22 @@ impl DeviceState {
         self.last_answer_end + self.settings.device.wire.limits.delay
     }
 
-    /// Whether its requests and the silence before them take so long that its periods are longer by more than those
-    /// of its bus.
-    fn is_filled_by_rest(&self, of_bus: &Pace) -> bool {
-        let cost = self.tariff.cost(self.turnaround.planned_with());
-        let rest = self.settings.device.wire.limits.delay;
-        !rest.is_zero() && self.polls.filled(|read| cost.time_of(read.span) + rest) > of_bus.stretch()
-    }
-
     /// How urgent its next question can be at most.
     pub(in crate::engine::bus) fn outlook(&self, now: Time) -> Outlook {
-        let reads = if self.is_present() { self.polls.by_period(now) } else { None };
-        Outlook { not_before: self.paused_until.max(self.rested_at()), reads }
+        let (reads, wanted) = match self.is_present() {
+            true => (self.polls.by_period(now), self.polls.wanted()),
+            false => (None, 0.0),
+        };
+        Outlook { not_before: self.paused_until.max(self.rested_at()), reads, wanted }
     }
 
-    pub(in crate::engine::bus) fn most_urgent(&self, now: Time) -> Option<(Polled, Urgency)> {
-        self.next_question(now, Urgency::Wanted, |polls| polls.most_urgent(now))
+    pub(in crate::engine::bus) fn most_urgent(&self, at: Moment) -> Option<(Polled, Urgency)> {
+        self.next_question(at.now, Urgency::Wanted, |polls| polls.most_urgent(at))
     }
 
     /// What has waited longest, wanted at once or not, and for how many of its periods.
-    pub(in crate::engine::bus) fn longest_waiting(&self, now: Time) -> Option<(Polled, f64)> {
-        self.next_question(now, f64::INFINITY, |polls| polls.longest_waiting(now))
+    pub(in crate::engine::bus) fn longest_waiting(&self, at: Moment) -> Option<(Polled, f64)> {
+        self.next_question(at.now, f64::INFINITY, |polls| polls.longest_waiting(at))
     }
 
     /// Its identification, if that is not known, which is as urgent as `of_identification`; or the read that
@@ -106,8 +107,6 @@ impl DeviceState {
 
     /// Returns what its turn was before.
     pub(in crate::engine::bus) fn begin_read(&mut self, read: usize, now: Time, pace: &mut Pace) -> Turn {
-        // What keeps it behind is its own rest, which says nothing of the line's other devices.
-        let pace = if self.is_filled_by_rest(pace) { &mut self.own_pace } else { pace };
         let place = self.polls.begin(read, now, pace);
         Turn { place: Some(place), ..self.turn() }
     }

@@ -6,7 +6,6 @@ use crate::engine::command::words_of;
 use crate::engine::device::{PointIndex, Poll};
 use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::plan::Read;
-use crate::engine::schedule::Pace;
 use crate::engine::state::Absorbed;
 use crate::engine::time::Time;
 use crate::engine::value::Missing;
@@ -25,7 +24,7 @@ impl DeviceState {
         if answered && self.presence != Presence::Present {
             // A device without an identification is there when it answers a read.
             self.arrive(now, context);
-            self.polls.begin(index, self.served_at, &mut Pace::default());
+            self.polls.began(index, self.served_at);
         }
         match result {
             Ok(answer) => {
