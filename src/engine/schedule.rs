@@ -104,6 +104,8 @@ pub struct Outlook {
     pub reads: Option<ByPeriod>,
     /// How many reads a second it wants.
     pub wanted: f64,
+    /// When it was last asked.
+    pub served_at: Time,
 }
 
 /// Of the fast and of the slow reads, the one that has waited longest.

@@ -3,6 +3,7 @@
 //! On a bus with many devices most of them are as they were since the last request. What each of them may
 //! want is therefore kept in few words; whoever can have changed a device makes them be found out anew.
 
+use std::cmp::Reverse;
 use std::ops::{Deref, DerefMut, Index, IndexMut};
 
 use crate::engine::pace::{Moment, Pace};
@@ -25,6 +26,27 @@ pub(super) struct Next {
     pub(super) urgency: Urgency,
 }
 
+/// Who goes first; the greatest does.
+#[derive(Clone, Copy, PartialEq, PartialOrd)]
+struct Rank {
+    urgency: Urgency,
+    served_at: Reverse<Time>,
+    device: Reverse<usize>,
+}
+
+impl Rank {
+    fn of(next: &Next, devices: &[DeviceState]) -> Rank {
+        let served_at = devices[next.device].served_at();
+        Rank { urgency: next.urgency, served_at: Reverse(served_at), device: Reverse(next.device) }
+    }
+
+    /// The greatest that a device can have.
+    fn at_most(device: usize, outlook: &Outlook, at: Moment) -> Option<Rank> {
+        let (urgency, served_at) = (outlook.at_most(at)?, Reverse(outlook.served_at));
+        Some(Rank { urgency, served_at, device: Reverse(device) })
+    }
+}
+
 impl Devices {
     /// What is most urgent of all devices that may be asked. Of two equally urgent ones, that which has waited
     /// longest.
@@ -35,23 +57,31 @@ impl Devices {
         may_ask: impl Fn(&DeviceState) -> bool,
     ) -> Option<Next> {
         let (at, mut wanted) = (pace.at(now), 0.0);
-        let mut best: Option<Next> = None;
+        // Who seems to be next is looked at first: nearly always nobody else need be.
+        let mut seems_next: Option<(Rank, usize)> = None;
         for (index, (device, outlook)) in self.list.iter().zip(&mut self.outlooks).enumerate() {
             let outlook = outlook.get_or_insert_with(|| device.outlook(now));
             wanted += outlook.wanted;
-            let Some(at_most) = outlook.at_most(at) else { continue };
-            if best.as_ref().is_some_and(|best| at_most < best.urgency) || !may_ask(device) {
-                continue;
-            }
-            let Some((polled, urgency)) = device.most_urgent(at) else { continue };
-            let is_better = best.as_ref().is_none_or(|best| {
-                let waited_longer = device.served_at() < self.list[best.device].served_at();
-                urgency > best.urgency || (urgency == best.urgency && waited_longer)
-            });
-            if is_better {
-                best = Some(Next { device: index, polled, urgency });
+            let Some(rank) = Rank::at_most(index, outlook, at) else { continue };
+            if seems_next.as_ref().is_none_or(|(best, _)| rank > *best) && may_ask(device) {
+                seems_next = Some((rank, index));
             }
         }
+        let first = seems_next.and_then(|(_, index)| self.next_of(index, at));
+        let mut best = first.map(|next| (Rank::of(&next, &self.list), next));
+        for index in 0..self.list.len() {
+            let is_known = seems_next.as_ref().is_some_and(|(_, first)| *first == index);
+            let rank = self.outlooks[index].as_ref().and_then(|outlook| Rank::at_most(index, outlook, at));
+            let is_better = |rank: &Rank| best.as_ref().is_none_or(|(best, _)| rank > best);
+            if is_known || !rank.as_ref().is_some_and(is_better) || !may_ask(&self.list[index]) {
+                continue;
+            }
+            let next = self.next_of(index, at).map(|next| (Rank::of(&next, &self.list), next));
+            if let Some((rank, next)) = next.filter(|(rank, _)| is_better(rank)) {
+                best = Some((rank, next));
+            }
+        }
+        let best = best.map(|(_, next)| next);
         debug_assert_eq!(
             best.as_ref().map(|best| (best.device, best.urgency)),
             self.most_urgent_by_looking(at, may_ask),
@@ -60,6 +90,11 @@ impl Devices {
         let is_ahead = |next: &Next| matches!(next.urgency, Urgency::Overdue(periods) if periods < 1.0);
         pace.want(wanted, best.as_ref().is_some_and(is_ahead));
         best
+    }
+
+    fn next_of(&self, device: usize, at: Moment) -> Option<Next> {
+        let (polled, urgency) = self.list[device].most_urgent(at)?;
+        Some(Next { device, polled, urgency })
     }
 
     /// The same by a look at everything, which any test of a bus holds the short way against.

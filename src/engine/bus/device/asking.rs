@@ -57,7 +57,8 @@ impl DeviceState {
             true => (self.polls.by_period(now), self.polls.wanted()),
             false => (None, 0.0),
         };
-        Outlook { not_before: self.paused_until.max(self.rested_at()), reads, wanted }
+        let not_before = self.paused_until.max(self.rested_at());
+        Outlook { not_before, reads, wanted, served_at: self.served_at }
     }
 
     pub(in crate::engine::bus) fn most_urgent(&self, at: Moment) -> Option<(Polled, Urgency)> {
