@@ -22,6 +22,8 @@ pub struct Polls {
 #[derive(Clone, Debug)]
 struct Planned {
     read: Arc<Read>,
+    /// That of the read, for whoever wants nothing else of it: what is not touched need not be fetched from memory.
+    span: Span,
     /// `None`: only after a connect or on request.
     period: Option<Duration>,
     /// Some point in it decides how others are read.
@@ -180,6 +182,7 @@ impl Polls {
                 Poll::Once | Poll::Never => None,
             },
             has_selector: read.points.iter().any(|(point, _)| is_selector(*point)),
+            span: read.span,
             read: Arc::new(read),
             began_at: None,
             sent_at: None,
@@ -203,6 +206,10 @@ impl Polls {
     /// The same, for longer than the schedule can be borrowed.
     pub fn shared_read(&self, index: usize) -> Arc<Read> {
         self.reads[index].read.clone()
+    }
+
+    pub fn span(&self, index: usize) -> Span {
+        self.reads[index].span
     }
 
     pub fn len(&self) -> usize {

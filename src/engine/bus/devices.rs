@@ -35,11 +35,6 @@ struct Rank {
 }
 
 impl Rank {
-    fn of(next: &Next, devices: &[DeviceState]) -> Rank {
-        let served_at = devices[next.device].served_at();
-        Rank { urgency: next.urgency, served_at: Reverse(served_at), device: Reverse(next.device) }
-    }
-
     /// The greatest that a device can have.
     fn at_most(device: usize, outlook: &Outlook, at: Moment) -> Option<Rank> {
         let (urgency, served_at) = (outlook.at_most(at)?, Reverse(outlook.served_at));
@@ -57,28 +52,32 @@ impl Devices {
         may_ask: impl Fn(&DeviceState) -> bool,
     ) -> Option<Next> {
         let (at, mut wanted) = (pace.at(now), 0.0);
-        // Who seems to be next is looked at first: nearly always nobody else need be.
-        let mut seems_next: Option<(Rank, usize)> = None;
+        // Who seems to be next is looked at first, and usually that is all: nobody else seems to be before it.
+        let (mut seems_next, mut seems_second): (Option<Rank>, Option<Rank>) = (None, None);
         for (index, (device, outlook)) in self.list.iter().zip(&mut self.outlooks).enumerate() {
             let outlook = outlook.get_or_insert_with(|| device.outlook(now));
             wanted += outlook.wanted;
             let Some(rank) = Rank::at_most(index, outlook, at) else { continue };
-            if seems_next.as_ref().is_none_or(|(best, _)| rank > *best) && may_ask(device) {
-                seems_next = Some((rank, index));
-            }
-        }
-        let first = seems_next.and_then(|(_, index)| self.next_of(index, at));
-        let mut best = first.map(|next| (Rank::of(&next, &self.list), next));
-        for index in 0..self.list.len() {
-            let is_known = seems_next.as_ref().is_some_and(|(_, first)| *first == index);
-            let rank = self.outlooks[index].as_ref().and_then(|outlook| Rank::at_most(index, outlook, at));
-            let is_better = |rank: &Rank| best.as_ref().is_none_or(|(best, _)| rank > best);
-            if is_known || !rank.as_ref().is_some_and(is_better) || !may_ask(&self.list[index]) {
+            if seems_second.is_some_and(|second| rank < second) || !may_ask(device) {
                 continue;
             }
-            let next = self.next_of(index, at).map(|next| (Rank::of(&next, &self.list), next));
-            if let Some((rank, next)) = next.filter(|(rank, _)| is_better(rank)) {
-                best = Some((rank, next));
+            match seems_next.replace(rank) {
+                Some(next) if rank < next => (seems_next, seems_second) = (Some(next), Some(rank)),
+                before => seems_second = before,
+            }
+        }
+        let first = seems_next.map(|rank| rank.device.0);
+        let mut best = first.and_then(|device| self.next_of(device, at));
+        if goes_before(seems_second, &best) {
+            for index in (0..self.list.len()).filter(|index| Some(*index) != first) {
+                let rank =
+                    self.outlooks[index].as_ref().and_then(|outlook| Rank::at_most(index, outlook, at));
+                if goes_before(rank, &best) && may_ask(&self.list[index]) {
+                    let next = self.next_of(index, at);
+                    if goes_before(next.as_ref().map(|(rank, _)| *rank), &best) {
+                        best = next;
+                    }
+                }
             }
         }
         let best = best.map(|(_, next)| next);
@@ -92,9 +91,10 @@ impl Devices {
         best
     }
 
-    fn next_of(&self, device: usize, at: Moment) -> Option<Next> {
+    fn next_of(&self, device: usize, at: Moment) -> Option<(Rank, Next)> {
         let (polled, urgency) = self.list[device].most_urgent(at)?;
-        Some(Next { device, polled, urgency })
+        let served_at = Reverse(self.list[device].served_at());
+        Some((Rank { urgency, served_at, device: Reverse(device) }, Next { device, polled, urgency }))
     }
 
     /// The same by a look at everything, which any test of a bus holds the short way against.
@@ -121,6 +121,10 @@ impl Devices {
         self.outlooks.remove(index);
         self.list.remove(index)
     }
+}
+
+fn goes_before(rank: Option<Rank>, best: &Option<(Rank, Next)>) -> bool {
+    rank > best.as_ref().map(|(rank, _)| *rank)
 }
 
 impl From<Vec<DeviceState>> for Devices {

@@ -127,7 +127,7 @@ impl DeviceState {
     }
 
     pub(in crate::engine::bus) fn span_of(&self, read: usize) -> Span {
-        self.polls.read(read).span
+        self.polls.span(read)
     }
 
     /// Whether one of the fast polls reads this point at its own place, and nothing waits for what it
