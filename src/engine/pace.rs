@@ -80,6 +80,11 @@ impl Pace {
         self.lets_ahead
     }
 
+    /// Whoever goes next has its turn, whether it is due by this time or not.
+    pub fn let_ahead(&mut self) {
+        self.lets_ahead = true;
+    }
+
     /// Nothing is due.
     pub fn idle(&mut self, now: Time) {
         self.idle = Some((now, self.clock(now).max(self.time + self.owed)));
@@ -135,6 +140,12 @@ impl Pace {
         let step = if is_more { Duration::from_secs_f64(1.0 / self.wanted) } else { left };
         self.time += step;
         self.owed = left.saturating_sub(step).min(Pace::OWED_MOST);
+    }
+
+    /// What went out of turn has taken so long. All have waited for it, but turns are the fewer: each may move the time
+    /// by what it is worth, though it takes less itself. Else this would hardly go on, and who is ahead would stay so.
+    pub fn went_before(&mut self, took: Duration) {
+        self.owed = (self.owed + took).min(Pace::OWED_MOST);
     }
 
     /// Whether periods are longer than they should be, and there was no moment within this time when nothing was due.

@@ -70,6 +70,8 @@ const ANSWERS_TO_FORGIVE: u8 = 8;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Place {
     began_at: Option<Time>,
+    sent_at: Option<Time>,
+    real_period: Option<Duration>,
     wanted_now: bool,
     failed_at: Option<Time>,
     was_due: bool,
@@ -290,7 +292,7 @@ impl Polls {
     pub fn begin(&mut self, index: usize, now: Time, pace: &mut Pace) -> Place {
         let (at, lets_ahead) = (pace.at(now), pace.lets_ahead());
         let planned = &mut self.reads[index];
-        let (began_at, wanted_now, failed_at) = (planned.began_at, planned.wanted_now, planned.failed_at);
+        let Planned { began_at, sent_at, real_period, wanted_now, failed_at, .. } = *planned;
         let is_for_period = !wanted_now && failed_at.is_none();
         // Whoever feeds a watchdog does not wait until it is due.
         let has_turn = |urgency| urgency >= 1.0 || lets_ahead;
@@ -313,19 +315,25 @@ impl Polls {
         planned.sent_at = Some(now);
         (planned.wanted_now, planned.failed_at) = (false, None);
         self.let_go(index, pace.at(now).turns);
-        Place { began_at, wanted_now, failed_at, was_due: in_turn.is_some() }
+        Place { began_at, sent_at, real_period, wanted_now, failed_at, was_due: in_turn.is_some() }
     }
 
     /// What keeps a device behind the others for longer than [`BEHIND_MOST`] is its own affair, such as the silence
-    /// that it wants, and is not made up for. All of its reads are put off alike, which leaves each its share.
+    /// that it wants, and is not made up for. All of its reads are put off alike, which leaves each its share; and what
+    /// some of them have not waited for, the one that has its turn loses alone.
     fn let_go(&mut self, index: usize, turns: Time) {
         let planned = &self.reads[index];
         let (Some(began_at), Some(period)) = (planned.began_at, planned.period) else { return };
         let too_much = (turns - began_at).saturating_sub(period * BEHIND_MOST);
-        if !too_much.is_zero() {
-            let of_all = self.reads.iter_mut().filter_map(|planned| planned.began_at.as_mut());
-            of_all.for_each(|at| *at = (*at + too_much).min(turns).max(*at));
+        if too_much.is_zero() {
+            return;
         }
+        let with_period = || self.reads.iter().filter(|planned| planned.period.is_some() && !planned.sleeps);
+        let waited = with_period().filter_map(|planned| planned.began_at.map(|at| turns - at));
+        let of_all = waited.fold(too_much, Duration::min);
+        let began = self.reads.iter_mut().filter_map(|planned| planned.began_at.as_mut());
+        began.for_each(|at| *at = (*at + of_all).min(turns).max(*at));
+        self.reads[index].began_at = Some(began_at + too_much);
     }
 
     /// The device turned out to be there by answering the read.
@@ -338,6 +346,7 @@ impl Polls {
     pub fn take_back(&mut self, index: usize, before: Place) {
         let planned = &mut self.reads[index];
         planned.began_at = before.began_at;
+        (planned.sent_at, planned.real_period) = (before.sent_at, before.real_period);
         planned.wanted_now |= before.wanted_now;
         planned.failed_at = planned.failed_at.or(before.failed_at);
     }

@@ -194,6 +194,21 @@ fn what_was_asked_in_vain_is_due_at_once_but_behind_whatever_else_is_due() {
 }
 
 #[test]
+fn what_was_taken_back_is_due_as_it_was() {
+    let mut polls = polls(&[Poll::Fast]);
+    // On a bus that cannot keep up its period is over by the clock alone.
+    let mut pace = Pace::default();
+    polls.begin(0, Time::default(), &mut pace);
+    let now = Time::from_millis(100);
+    let before = polls.most_urgent(pace.at(now));
+    assert!(matches!(before, Some((0, Urgency::Overdue(_)))), "{before:?}");
+    let place = polls.begin(0, now, &mut pace);
+    polls.take_back(0, place);
+    assert_eq!(polls.most_urgent(pace.at(now)), before);
+    assert_eq!(polls.real_period(Poll::Fast, now), None);
+}
+
+#[test]
 fn a_read_is_well_known_when_it_comes_often_and_has_been_answered_often() {
     let mut polls = polls(&[Poll::Fast, Poll::Once]);
     for answers in 1..=40 {

@@ -4,8 +4,10 @@
 mod feeding;
 mod forecast;
 mod network;
+mod plain;
 mod plans;
 mod random;
+mod turns;
 mod wire;
 
 use std::process::Command;

@@ -75,6 +75,8 @@ pub(super) struct DeviceState {
     /// It may be slow until then: it has been written to, or seemed to be slow.
     busy_until: Time,
     served_at: Time,
+    /// That was because somebody wanted it at once.
+    pub(super) was_asked_out_of_turn: bool,
     last_answer_end: Time,
     last_answer_at: Option<Time>,
 
@@ -128,6 +130,7 @@ impl DeviceState {
             paused_until: Time::default(),
             busy_until: Time::default(),
             served_at: Time::default(),
+            was_asked_out_of_turn: false,
             last_answer_end: Time::default(),
             last_answer_at: None,
             values,

@@ -68,7 +68,6 @@ impl Bus {
         let delays = self.devices.iter().map(|device| device.device().wire.connect_delay);
         self.silent_until = self.now + delays.max().unwrap_or_default();
         self.record_note("the link is up");
-        self.pace.idle(self.now);
         (self.connection.up_at, self.connection.answers) = (self.now, 0);
         match std::mem::replace(&mut self.link_state, LinkState::Up) {
             // The devices are as silent as they were, and are asked as seldom.
@@ -81,6 +80,9 @@ impl Bus {
             }
             LinkState::Down { .. } | LinkState::Up => {}
         }
+        // All have waited for it. Not for one connection after the other, as a server makes them that closes each behind
+        // its answer: they come also where reads are due all the time.
+        self.pace.idle(self.now);
         self.connection.is_proven = false;
         for device in &mut self.devices {
             device.reconnect(self.now);

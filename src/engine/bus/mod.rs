@@ -430,7 +430,6 @@ impl Bus {
     /// The request on the wire has ended: counts what is to be learnt about the line, and then sees to the answer.
     fn reply(&mut self, reply: Reply) {
         let Some(in_flight) = self.in_flight.take() else { return };
-        self.count_turn(&in_flight, &reply);
         self.record_reply(in_flight.device, &reply);
         self.counters.count_result(&reply.result);
         self.counters.count_discarded(reply.discarded);
@@ -448,6 +447,7 @@ impl Bus {
         self.look_for_signs(in_flight.device, &reply);
         let silence = in_flight.device.zip(self.silence_behind(&reply));
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
+        self.count_turn(&in_flight, &reply);
         // Before anything more is asked on it.
         self.renew_used_connection();
         self.renew_silent_connection();

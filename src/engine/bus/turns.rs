@@ -68,11 +68,19 @@ impl Bus {
                     continue;
                 }
                 self.pace.idle(now);
-                // No read has had to wait for what went out of turn.
-                self.ahead = 0;
+                self.nobody_was_kept_waiting();
                 return;
             };
             self.poll(device, polled);
+        }
+    }
+
+    /// Nothing that is due may be asked: what went out of turn has kept no read waiting, but for those of a device that
+    /// wants silence behind it.
+    fn nobody_was_kept_waiting(&mut self) {
+        let at = self.pace.at(self.now);
+        if self.ahead > 0 && !self.askable().any(|(_, device)| device.keeps_waiting(at)) {
+            self.ahead = 0;
         }
     }
 
@@ -86,11 +94,17 @@ impl Bus {
 
     /// A request has had its turn.
     pub(super) fn count_turn(&mut self, ended: &InFlight, reply: &Reply) {
-        // In a silence all have waited, and behind what goes out of turn as well: nobody makes up for it.
+        // In a silence all have waited: nobody makes up for it.
         let was_turn = ended.before.is_some_and(|before| before.was_in_turn());
+        let is_silence = reply.result == Err(RequestError::Timeout);
+        let took = if is_silence { Duration::ZERO } else { self.now - ended.decided_at };
         if was_turn {
-            let is_silence = reply.result == Err(RequestError::Timeout);
-            self.pace.had_turn(if is_silence { Duration::ZERO } else { self.now - ended.decided_at });
+            self.pace.had_turn(took);
+        } else {
+            self.pace.went_before(took);
+        }
+        if let Some(device) = ended.device {
+            self.devices[device].was_asked_out_of_turn = ended.out_of_turn;
         }
         if ended.out_of_turn {
             self.ahead += 1;
@@ -104,14 +118,19 @@ impl Bus {
         if self.ahead < AHEAD_OF_READS {
             return false;
         }
-        self.ahead = 0;
         let at = self.pace.at(self.now);
         let overdue = self.askable().filter_map(|(index, device)| {
             let (polled, waited) = device.longest_waiting(at)?;
             Some((index, polled, waited))
         });
         let longest = overdue.reduce(|best, other| if other.2 > best.2 { other } else { best });
-        let Some((device, polled, _)) = longest else { return false };
+        let Some((device, polled, _)) = longest else {
+            self.nobody_was_kept_waiting();
+            return false;
+        };
+        self.ahead = 0;
+        // It is a turn as any other, also where it is not due by the time of the bus, which hardly goes on now.
+        self.pace.let_ahead();
         self.poll(device, polled);
         if let Some(in_flight) = &mut self.in_flight {
             in_flight.out_of_turn = false;

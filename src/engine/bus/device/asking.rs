@@ -46,6 +46,12 @@ impl DeviceState {
         }
     }
 
+    /// Whether something is due, and only the silence that it wants is in its way.
+    pub(in crate::engine::bus) fn keeps_waiting(&self, at: Moment) -> bool {
+        let is_due = || self.polls.due_at(at).is_some_and(|due| due <= at.now);
+        at.now < self.paused_until.max(self.rested_at()) && self.is_present() && is_due()
+    }
+
     /// Before, it wants silence. Others may be asked meanwhile.
     fn rested_at(&self) -> Time {
         self.last_answer_end + self.settings.device.wire.limits.delay
@@ -62,11 +68,18 @@ impl DeviceState {
     }
 
     pub(in crate::engine::bus) fn most_urgent(&self, at: Moment) -> Option<(Polled, Urgency)> {
+        if at.now < self.rested_at() {
+            return None;
+        }
         self.next_question(at.now, Urgency::Wanted, |polls| polls.most_urgent(at))
     }
 
-    /// What has waited longest, wanted at once or not, and for how many of its periods.
+    /// What has waited longest, wanted at once or not, and for how many of its periods. If what goes out of turn is for
+    /// this device, that would go on as soon as it has rested: then the read waits for that on the wire, as a command does.
     pub(in crate::engine::bus) fn longest_waiting(&self, at: Moment) -> Option<(Polled, f64)> {
+        if at.now < self.rested_at() && !self.was_asked_out_of_turn {
+            return None;
+        }
         self.next_question(at.now, f64::INFINITY, |polls| polls.longest_waiting(at))
     }
 
@@ -78,7 +91,7 @@ impl DeviceState {
         of_identification: U,
         of_polls: impl FnOnce(&Polls) -> Option<(usize, U)>,
     ) -> Option<(Polled, U)> {
-        if now < self.paused_until || now < self.rested_at() {
+        if now < self.paused_until {
             return None;
         }
         if self.presence != Presence::Present {

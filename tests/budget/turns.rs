@@ -1,0 +1,498 @@
+//! Random buses, and what may befall them: nobody starves, the periods that a bus can keep are kept, and a bus that
+//! cannot keep them stretches all alike, also after a disturbance. It sleeps past nothing that is due, and wakes for
+//! nothing that is not.
+//!
+//! `CASES=2000 SEED=7 cargo test --test budget turns` looks at more of them, and at others.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use busker::engine::time::{Duration, Time};
+use proptest::prelude::*;
+use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
+
+use super::plain::Plain;
+
+#[derive(Clone, Debug)]
+struct Unit {
+    /// All of these in milliseconds: the poll periods, how long a request takes, and the silence that it wants.
+    fast: u64,
+    slow: u64,
+    cost: u64,
+    rest: u64,
+    /// How many reads it has of each class.
+    fast_reads: u16,
+    slow_reads: u16,
+    /// And those that are read once.
+    once_reads: u16,
+}
+
+/// What happens to a bus for a while.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Trouble {
+    Nothing,
+    /// A command for this unit as soon as there is no other.
+    Commands(usize),
+    /// One now and then, so many milliseconds apart.
+    SomeCommands(usize, u64),
+    /// Somebody wants this unit's first point to be told, again and again.
+    Gets(usize, u64),
+    /// It does not answer.
+    Dead(usize),
+    /// It answers with this exception.
+    Refuses(usize, u8),
+    /// It takes five times as long.
+    Slow(usize),
+    /// Each so-manieth request meets another.
+    Collisions(u64),
+    /// The link breaks, and breaks again.
+    Breaks(u64),
+    /// It leaves the configuration, and comes back in the end.
+    Leaves(usize),
+}
+
+#[derive(Clone, Debug)]
+struct Case {
+    is_network: bool,
+    /// A server that closes each connection behind its answer.
+    closes: bool,
+    units: Vec<Unit>,
+    troubles: Vec<(Trouble, u64)>,
+}
+
+/// One as likely between 1 and 10 as between 10 and 100.
+fn log(from: f64, to: f64) -> impl Strategy<Value = u64> {
+    (0.0..1.0_f64).prop_map(move |part| (from * libm::pow(to / from, part)) as u64)
+}
+
+fn unit() -> impl Strategy<Value = Unit> {
+    let fast = prop_oneof![9 => log(20.0, 5_000.0), 1 => log(1.0, 20.0)];
+    let times = (fast, 1..15_u64, log(1.0, 80.0), prop_oneof![4 => Just(0), 1 => log(5.0, 200.0)]);
+    let reads = prop_oneof![8 => (1..5_u16, 0..4_u16), 1 => (0..1_u16, 1..4_u16), 1 => (0..1_u16, 0..1_u16)];
+    (times, reads, prop_oneof![3 => Just(0_u16), 1 => Just(1)]).prop_map(
+        |((fast, ratio, cost, rest), (fast_reads, slow_reads), once_reads)| Unit {
+            fast,
+            slow: fast * ratio,
+            cost,
+            rest,
+            fast_reads,
+            slow_reads,
+            once_reads,
+        },
+    )
+}
+
+fn trouble() -> impl Strategy<Value = Trouble> {
+    let any = 0..100_usize;
+    prop_oneof![
+        1 => Just(Trouble::Nothing),
+        2 => any.clone().prop_map(Trouble::Commands),
+        1 => (any.clone(), log(5.0, 3000.0)).prop_map(|(unit, every)| Trouble::SomeCommands(unit, every)),
+        1 => (any.clone(), log(5.0, 3000.0)).prop_map(|(unit, every)| Trouble::Gets(unit, every)),
+        2 => any.clone().prop_map(Trouble::Dead),
+        2 => (any.clone(), prop_oneof![Just(4_u8), Just(5), Just(6)])
+            .prop_map(|(unit, code)| Trouble::Refuses(unit, code)),
+        1 => any.clone().prop_map(Trouble::Slow),
+        1 => (2..20_u64).prop_map(Trouble::Collisions),
+        1 => log(100.0, 20_000.0).prop_map(Trouble::Breaks),
+        1 => any.prop_map(Trouble::Leaves),
+    ]
+}
+
+fn case() -> impl Strategy<Value = Case> {
+    let troubles = prop::collection::vec((trouble(), log(1_000.0, 60_000.0)), 0..4);
+    let link = prop_oneof![3 => Just((false, false)), 3 => Just((true, false)), 1 => Just((true, true))];
+    (link, prop::collection::vec(unit(), 1..6), troubles)
+        .prop_map(|((is_network, closes), units, troubles)| Case { is_network, closes, units, troubles })
+}
+
+/// The reads of a unit are too far apart to be one, and the slow ones lie behind these.
+const APART: u16 = 200;
+const SLOW_FROM: u16 = 2_000;
+const ONCE_FROM: u16 = 4_000;
+const WRITABLE: u16 = 6_000;
+/// So long it takes at most until a device that was left alone is asked again.
+const FORGOTTEN: u64 = 70_000;
+/// A device that leaves for a while has all of its reads answered again, and some rounds.
+const SETTLES: u64 = 10_000;
+
+impl Case {
+    fn configuration(&self) -> String {
+        let link = match self.is_network {
+            true => "tcp: \"10.0.0.1:502\"",
+            false => "serial: /dev/serial/by-id/usb-A, baud: 115200",
+        };
+        let mut text = format!("buses:\n  line: {{{link}, response_timeout: 500ms}}\ndevices:\n");
+        for (index, unit) in self.units.iter().enumerate() {
+            let mut points =
+                format!("w: {{at: holding {WRITABLE}, type: u16, poll: never, write: 0..65535}}");
+            let mut reads = |class: &str, count: u16, from: u16| {
+                for number in 0..count {
+                    let at = from + number * APART;
+                    let _ =
+                        write!(points, ", {class}{number}: {{at: holding {at}, type: u16, poll: {class}}}");
+                }
+            };
+            reads("fast", unit.fast_reads, 0);
+            reads("slow", unit.slow_reads, SLOW_FROM);
+            reads("once", unit.once_reads, ONCE_FROM);
+            let _ = writeln!(
+                text,
+                "  unit_{number}: {{bus: line, unit: {number}, poll: {{fast: {}ms, slow: {}ms}}, \
+                 wire: {{limits: {{delay: {}ms}}}}, points: {{{points}}}}}",
+                unit.fast,
+                unit.slow,
+                unit.rest,
+                number = index + 1,
+            );
+        }
+        text
+    }
+
+    /// By unit and address: the period, in seconds.
+    fn periods(&self) -> BTreeMap<(u8, u16), f64> {
+        let mut periods = BTreeMap::new();
+        for (index, unit) in self.units.iter().enumerate() {
+            let place = |from: u16, number: u16| (index as u8 + 1, from + number * APART);
+            let fast = (0..unit.fast_reads).map(|number| (place(0, number), unit.fast as f64 / 1e3));
+            let slow = (0..unit.slow_reads).map(|number| (place(SLOW_FROM, number), unit.slow as f64 / 1e3));
+            periods.extend(fast.chain(slow));
+        }
+        periods
+    }
+
+    /// How much of the wire's time is wanted.
+    fn load(&self, cost: impl Fn(&Unit) -> f64) -> f64 {
+        self.units.iter().map(|unit| unit.reads_a_second() * cost(unit)).sum()
+    }
+}
+
+impl Unit {
+    fn cost(&self) -> f64 {
+        self.cost as f64 / 1e3
+    }
+
+    fn rest(&self) -> f64 {
+        self.rest as f64 / 1e3
+    }
+
+    fn count(&self) -> f64 {
+        f64::from(self.fast_reads + self.slow_reads)
+    }
+
+    fn reads_a_second(&self) -> f64 {
+        // What is never read is asked nevertheless whether it is there.
+        let is_silent = self.fast_reads + self.slow_reads + self.once_reads == 0;
+        let slow_reads = if is_silent { 1 } else { self.slow_reads };
+        f64::from(self.fast_reads) * 1e3 / self.fast as f64 + f64::from(slow_reads) * 1e3 / self.slow as f64
+    }
+}
+
+/// By unit and address, when it was asked.
+type Times = BTreeMap<(u8, u16), Vec<Time>>;
+
+fn times(line: &mut Plain) -> Times {
+    let mut times = Times::new();
+    for asked in line.asked.drain(..) {
+        times.entry((asked.unit, asked.address)).or_default().push(asked.at);
+    }
+    times
+}
+
+/// So many times what it would be if everybody had their share at each moment a read may wait: others may be two periods
+/// behind when it has just had its turn, and those and its own it then waits for.
+const UNEVENLY: f64 = 4.0;
+/// And so long in any case, behind a silence and what is asked again behind that.
+const SILENCE: f64 = 2.0;
+const WITHIN: f64 = 0.1;
+/// What has come round more seldom has no mean to speak of.
+const ROUNDS: usize = 30;
+
+fn fault_of(case: &Case) -> Result<(), TestCaseError> {
+    let mut line = Plain::new(&case.configuration(), case.units.iter().map(|unit| unit.cost).collect());
+    let fail = |text: String| TestCaseError::fail(format!("{text}\n{}", case.configuration()));
+    line.closes = case.closes;
+    line.run_for(SETTLES).map_err(fail)?;
+    for (trouble, lasts) in &case.troubles {
+        line.asked.clear();
+        case.run_troubled(&mut line, *trouble, *lasts)
+            .map_err(|text| fail(format!("{trouble:?}: {text}")))?;
+        // A device that is away, or refuses something, is asked again only so often.
+        if matches!(trouble, Trouble::Dead(_) | Trouble::Refuses(..) | Trouble::Breaks(_)) {
+            line.run_for(FORGOTTEN).map_err(fail)?;
+        }
+    }
+    line.run_for(SETTLES).map_err(fail)?;
+    line.asked.clear();
+    let from = line.now;
+    // For as long as the slowest needs, within reason.
+    let longest = case.periods().values().copied().fold(1.0, f64::max) * case.load(Unit::cost).max(1.0);
+    let until = from + Duration::from_secs_f64(longest * (ROUNDS + 2) as f64);
+    while line.now < until && line.asked.len() < REQUESTS {
+        line.run_for(1_000).map_err(fail)?;
+    }
+    let times = times(&mut line);
+    case.look_for_starving(&times, [from, line.now], Unit::cost).map_err(fail)?;
+    case.look_for_unfairness(&times).map_err(fail)
+}
+
+const REQUESTS: usize = 4_000;
+
+impl Case {
+    fn run_troubled(&self, line: &mut Plain, trouble: Trouble, lasts: u64) -> Result<(), String> {
+        let count = self.units.len();
+        let from = line.now;
+        let until = from + Duration::from_millis(lasts);
+        match trouble {
+            Trouble::Nothing => line.run_for(lasts)?,
+            Trouble::Commands(unit) => {
+                line.flood = Some(unit % count);
+                line.run_for(lasts)?;
+                line.flood = None;
+            }
+            Trouble::SomeCommands(unit, every) => {
+                while line.now < until {
+                    line.command(unit % count);
+                    line.run_for(every)?;
+                }
+            }
+            Trouble::Gets(unit, every) => {
+                while line.now < until {
+                    line.get(unit % count, "fast0");
+                    line.run_for(every)?;
+                }
+            }
+            Trouble::Dead(unit) => {
+                line.dead = Some(unit % count);
+                line.run_for(lasts)?;
+                line.dead = None;
+            }
+            Trouble::Refuses(unit, code) => {
+                line.refuses = Some((unit % count, code));
+                line.run_for(lasts)?;
+                line.refuses = None;
+            }
+            Trouble::Slow(unit) => {
+                line.costs[unit % count] *= SLOWER;
+                line.run_for(lasts)?;
+                line.costs[unit % count] /= SLOWER;
+            }
+            Trouble::Collisions(each) => {
+                line.collides_each = Some(each);
+                line.run_for(lasts)?;
+                line.collides_each = None;
+            }
+            Trouble::Breaks(every) => {
+                while line.now < until {
+                    line.break_link();
+                    line.run_for(every)?;
+                }
+            }
+            Trouble::Leaves(unit) => {
+                line.retire(unit % count);
+                line.run_for(lasts)?;
+                line.adopt(unit % count);
+            }
+        }
+        let unit = match trouble {
+            Trouble::Commands(unit)
+            | Trouble::SomeCommands(unit, _)
+            | Trouble::Gets(unit, _)
+            | Trouble::Dead(unit)
+            | Trouble::Refuses(unit, _)
+            | Trouble::Slow(unit)
+            | Trouble::Leaves(unit) => unit,
+            _ => 0,
+        };
+        let (number, unit) = ((unit % count + 1) as u8, &self.units[unit % count]);
+        let mut times = times(line);
+        let span = [from, line.now];
+        match trouble {
+            // Each read comes behind eight others.
+            Trouble::Commands(_) | Trouble::SomeCommands(..) | Trouble::Gets(..) => {
+                let of_others = AHEAD * (unit.rest() + unit.cost());
+                self.look_for_starving(&times, span, |of| of.cost() + of_others)
+            }
+            Trouble::Slow(_) => self.look_for_starving(&times, span, |of| of.cost() * SLOWER as f64),
+            Trouble::Nothing => self.look_for_starving(&times, span, Unit::cost),
+            Trouble::Leaves(_) | Trouble::Refuses(..) => {
+                times.retain(|(of, _), _| *of != number);
+                self.look_for_starving(&times, span, Unit::cost)
+            }
+            Trouble::Collisions(_) => self.look_for_starving(&times, span, |of| of.cost() + COLLISION),
+            // Others have to wait for its silence, and it is asked as seldom as it pleases.
+            Trouble::Dead(_) | Trouble::Breaks(_) => Ok(()),
+        }
+    }
+
+    /// Each read that is asked at all has its turn within a few times what would be its share of the wire.
+    fn look_for_starving(
+        &self,
+        times: &Times,
+        [from, until]: [Time; 2],
+        cost: impl Fn(&Unit) -> f64,
+    ) -> Result<(), String> {
+        let load = self.load(&cost).max(1.0);
+        let round: f64 = self.units.iter().map(|unit| unit.count() * cost(unit)).sum();
+        for (read, period) in self.periods() {
+            let Some(asked) = times.get(&read) else {
+                if self.is_left_out(times, read.0) {
+                    continue;
+                }
+                let waited = (until - from).as_secs_f64();
+                self.within(read, waited, period, load, round)?;
+                continue;
+            };
+            let moments: Vec<Time> = [from].into_iter().chain(asked.iter().copied()).chain([until]).collect();
+            let longest =
+                moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).fold(0.0, f64::max);
+            self.within(read, longest, period, load, round)?;
+        }
+        Ok(())
+    }
+
+    fn is_left_out(&self, times: &Times, unit: u8) -> bool {
+        !times.keys().any(|(of, _)| *of == unit)
+    }
+
+    fn within(&self, read: (u8, u16), waited: f64, period: f64, load: f64, round: f64) -> Result<(), String> {
+        let unit = &self.units[usize::from(read.0) - 1];
+        // The silence that it wants is its own affair.
+        let of_its_own = unit.reads_a_second() * (unit.rest() + unit.cost());
+        let most = (load + of_its_own) * period * UNEVENLY + round + SILENCE;
+        (waited <= most)
+            .then_some(())
+            .ok_or_else(|| format!("{read:?} waited for {waited:.3} s, more than {most:.3} s"))
+    }
+
+    /// By how much the periods are longer than they should be, but for those of units that must be slower for their silence.
+    fn stretches(&self, times: &Times) -> Vec<f64> {
+        let mut stretches = Vec::new();
+        for (read, period) in self.periods() {
+            let Some(asked) = times.get(&read).filter(|asked| asked.len() > ROUNDS) else { continue };
+            let found = (asked[asked.len() - 1] - asked[0]).as_secs_f64() / (asked.len() - 1) as f64;
+            let unit = &self.units[usize::from(read.0) - 1];
+            let has_to_rest = unit.rest > 0 && unit.reads_a_second() * (unit.rest() + unit.cost()) > 0.5;
+            if !has_to_rest {
+                stretches.push(found / period);
+            }
+        }
+        stretches
+    }
+
+    /// Where the bus keeps up so does each read; where it does not all are slower by the same factor.
+    fn look_for_unfairness(&self, times: &Times) -> Result<(), String> {
+        let load = self.load(Unit::cost);
+        let stretches = self.stretches(times);
+        let least = stretches.iter().copied().fold(f64::MAX, f64::min);
+        let most = stretches.iter().copied().fold(0.0, f64::max);
+        let is_kept = load > KEEPS_UP || (least > 1.0 - WITHIN && most < 1.0 + WITHIN);
+        let is_fair = load < OVERLOADED || most < least * (1.0 + WITHIN);
+        let told = || format!("load {load:.3}: stretched by {stretches:.3?}");
+        (stretches.is_empty() || (is_kept && is_fair)).then_some(()).ok_or_else(told)
+    }
+}
+
+/// So many requests that somebody wants at once may go before a read.
+const AHEAD: f64 = 8.0;
+const SLOWER: u64 = 5;
+/// What a request that meets another takes until it is asked again.
+const COLLISION: f64 = 0.6;
+/// A bus keeps up at less, and does not at more.
+const KEEPS_UP: f64 = 0.7;
+const OVERLOADED: f64 = 1.1;
+
+#[test]
+fn nobody_starves_and_all_have_equal_shares_after_whatever_befell_the_bus() {
+    let number = |name: &str| std::env::var(name).ok().and_then(|value| value.parse().ok());
+    let config =
+        Config { cases: number("CASES").unwrap_or(CASES), failure_persistence: None, ..Config::default() };
+    let mut seed = [0; 32];
+    seed[..4].copy_from_slice(&number("SEED").unwrap_or(1).to_le_bytes());
+    let random = TestRng::from_seed(RngAlgorithm::ChaCha, &seed);
+    let outcome = TestRunner::new_with_rng(config, random).run(&case(), |case| fault_of(&case));
+    outcome.unwrap_or_else(|fault| panic!("{fault}"));
+}
+
+const CASES: u32 = 24;
+
+/// What random cases have found.
+#[test]
+fn nobody_starves_where_somebody_did() {
+    let unit = |[fast, slow, cost, rest]: [u64; 4], [fast_reads, slow_reads]: [u16; 2]| Unit {
+        fast,
+        slow,
+        cost,
+        rest,
+        fast_reads,
+        slow_reads,
+        once_reads: 0,
+    };
+    let commanded = || unit([1_000, 10_000, 20, 0], [1, 0]);
+    let resting = |rest| unit([100, 1_000, 5, rest], [3, 1]);
+    for (what, closes, units, trouble) in [
+        (
+            "commands: turns that went before their time did not count, and fast reads had them all",
+            false,
+            vec![commanded(), unit([100, 2_000, 20, 0], [1, 2])],
+            Trouble::Commands(0),
+        ),
+        (
+            "commands without a moment between them: the time that they took did not count, and who was ahead stayed so",
+            false,
+            vec![unit([20, 120, 38, 0], [0, 0]), unit([20, 40, 1, 0], [1, 1])],
+            Trouble::SomeCommands(0, 5),
+        ),
+        (
+            "commands for a device that rests behind each: they waited for that on the wire, and reads did not",
+            false,
+            vec![resting(20)],
+            Trouble::Commands(0),
+        ),
+        (
+            "wishes for a point of a device that rests: meanwhile nothing was due, and they were counted anew",
+            false,
+            vec![resting(100)],
+            Trouble::Gets(0, 20),
+        ),
+        (
+            "a server that closes each connection: the bus was taken to be done with everything at each new one",
+            true,
+            vec![unit([11, 66, 8, 0], [2, 3]), unit([7, 77, 1, 0], [4, 0])],
+            Trouble::Nothing,
+        ),
+        (
+            "a device that rests on a bus that is never done: its fast reads had put off its slow ones by more than those              had waited",
+            false,
+            vec![
+                unit([34, 408, 60, 84], [4, 3]),
+                unit([42, 42, 14, 0], [2, 0]),
+                unit([128, 1_024, 1, 0], [3, 0]),
+            ],
+            Trouble::Nothing,
+        ),
+        (
+            "a device that is asked much more seldom than it wants: one of its reads made up for all that it had waited",
+            false,
+            vec![unit([1, 1, 1, 5], [3, 3]), unit([46, 138, 3, 0], [2, 3])],
+            Trouble::Slow(1),
+        ),
+    ] {
+        let case = Case { is_network: true, closes, units, troubles: vec![(trouble, 40_000)] };
+        fault_of(&case).unwrap_or_else(|fault| panic!("{what}: {fault}"));
+    }
+}
+
+/// What is asked again at once is one turn, and its period is not over the sooner.
+#[test]
+fn a_read_that_collides_each_time_comes_no_more_often() {
+    let unit =
+        Unit { fast: 1_000, slow: 1_000, cost: 100, rest: 0, fast_reads: 1, slow_reads: 0, once_reads: 0 };
+    let case = Case { is_network: false, closes: false, units: vec![unit], troubles: Vec::new() };
+    let mut line = Plain::new(&case.configuration(), vec![100]);
+    line.collides_each = Some(2);
+    line.run_for(SETTLES).expect("no fault");
+    line.asked.clear();
+    line.run_for(60_000).expect("no fault");
+    assert!((59..=61).contains(&line.asked.len()), "{}", line.asked.len());
+}
