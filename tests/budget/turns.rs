@@ -317,7 +317,10 @@ impl Case {
             Trouble::Nothing => self.look_for_starving(&times, span, Unit::cost),
             Trouble::Leaves(_) | Trouble::Refuses(..) => {
                 times.retain(|(of, _), _| *of != number);
-                self.look_for_starving(&times, span, Unit::cost)
+                // What is busy is asked again soon, before all others.
+                let is_busy = matches!(trouble, Trouble::Refuses(_, 5 | 6));
+                let of_others = if is_busy { AHEAD * unit.cost() } else { 0.0 };
+                self.look_for_starving(&times, span, |of| of.cost() + of_others)
             }
             Trouble::Collisions(_) => self.look_for_starving(&times, span, |of| of.cost() + COLLISION),
             // Others have to wait for its silence, and it is asked as seldom as it pleases.
@@ -372,7 +375,9 @@ impl Case {
             let Some(asked) = times.get(&read).filter(|asked| asked.len() > ROUNDS) else { continue };
             let found = (asked[asked.len() - 1] - asked[0]).as_secs_f64() / (asked.len() - 1) as f64;
             let unit = &self.units[usize::from(read.0) - 1];
-            let has_to_rest = unit.rest > 0 && unit.reads_a_second() * (unit.rest() + unit.cost()) > 0.5;
+            // It cannot be asked twice in a row where there are others, and decides itself how much slower that makes it.
+            let is_often_asked = unit.reads_a_second() * (unit.rest() + unit.cost()) > 0.5;
+            let has_to_rest = unit.rest > 0 && (is_often_asked || self.load(Unit::cost) > KEEPS_UP);
             if !has_to_rest {
                 stretches.push(found / period);
             }
