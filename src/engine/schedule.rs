@@ -319,21 +319,12 @@ impl Polls {
     }
 
     /// What keeps a device behind the others for longer than [`BEHIND_MOST`] is its own affair, such as the silence
-    /// that it wants, and is not made up for. All of its reads are put off alike, which leaves each its share; and what
-    /// some of them have not waited for, the one that has its turn loses alone.
+    /// that it wants, and is not made up for. Each of its reads loses that when it has its turn: put off together, those
+    /// with long periods would lose again and again what they have waited.
     fn let_go(&mut self, index: usize, turns: Time) {
-        let planned = &self.reads[index];
+        let planned = &mut self.reads[index];
         let (Some(began_at), Some(period)) = (planned.began_at, planned.period) else { return };
-        let too_much = (turns - began_at).saturating_sub(period * BEHIND_MOST);
-        if too_much.is_zero() {
-            return;
-        }
-        let with_period = || self.reads.iter().filter(|planned| planned.period.is_some() && !planned.sleeps);
-        let waited = with_period().filter_map(|planned| planned.began_at.map(|at| turns - at));
-        let of_all = waited.fold(too_much, Duration::min);
-        let began = self.reads.iter_mut().filter_map(|planned| planned.began_at.as_mut());
-        began.for_each(|at| *at = (*at + of_all).min(turns).max(*at));
-        self.reads[index].began_at = Some(began_at + too_much);
+        planned.began_at = Some(began_at + (turns - began_at).saturating_sub(period * BEHIND_MOST));
     }
 
     /// The device turned out to be there by answering the read.
