@@ -52,6 +52,8 @@ impl Pace {
     const BEHIND: f64 = 1.1;
     /// The longest request at 4800 Bd takes as long: what is wanted more often meanwhile has its turns behind it.
     const OWED_MOST: Duration = Duration::from_millis(600);
+    /// What keeps a read behind for more of its periods is its device's own affair, such as the silence that it wants.
+    const BEHIND_MOST: u32 = 2;
     /// A bus that had nothing to do within this time keeps up, whatever has kept it since.
     const KEEPS_UP: Duration = Duration::from_secs(2);
 
@@ -111,7 +113,8 @@ impl Pace {
     pub fn begin_turn(&mut self, now: Time, due: Time, period: Duration, stretch: f64) -> Time {
         self.busy(now);
         self.stretch = (self.stretch + (stretch - self.stretch) * Pace::STEP).max(1.0);
-        if self.keeps_up(now) && self.time - due >= period {
+        let behind = self.time - due;
+        if self.keeps_up(now) && behind >= period {
             // It was the device itself that kept it waiting: that is not made up for.
             return self.time;
         }
@@ -120,7 +123,9 @@ impl Pace {
         self.owed = self.owed.saturating_sub(ahead);
         self.time += ahead;
         if due <= until {
-            return due;
+            // Each read loses by itself what is too much: put off together, those of a device that have long periods would
+            // lose again and again what they have waited.
+            return due + behind.saturating_sub(period * Pace::BEHIND_MOST);
         }
         // Nothing else is due. Where that is usual a little delay does not shift those after it: the period is kept on
         // average. What has waited for longer, or is ahead on a bus that cannot keep up, counts from here.

@@ -56,10 +56,6 @@ struct Planned {
 /// its turn comes nevertheless.
 const REPEATED_BEHIND: Duration = Duration::from_secs(2);
 
-/// So many of its periods a read may be behind in the time of the bus; with its turn it is then two periods or so
-/// since it had the one before.
-const BEHIND_MOST: u32 = 2;
-
 /// A read that comes at least so often, and has been answered so often since its device connected, holds no
 /// surprise any more. After one that was not answered it takes a few more.
 const PERIOD_WELL_KNOWN: Duration = Duration::from_secs(10);
@@ -284,7 +280,8 @@ impl Polls {
 
     /// How many reads a second are wanted by their periods.
     pub fn wanted(&self) -> f64 {
-        self.filled(|_| Duration::from_secs(1))
+        let awake = self.reads.iter().filter(|planned| !planned.sleeps);
+        awake.filter_map(|planned| Some(1.0 / planned.period?.as_secs_f64().max(1e-6))).sum()
     }
 
     /// The read is being sent; returns where it stood before. `pace` is that of the
@@ -314,17 +311,7 @@ impl Polls {
         }
         planned.sent_at = Some(now);
         (planned.wanted_now, planned.failed_at) = (false, None);
-        self.let_go(index, pace.at(now).turns);
         Place { began_at, sent_at, real_period, wanted_now, failed_at, was_due: in_turn.is_some() }
-    }
-
-    /// What keeps a device behind the others for longer than [`BEHIND_MOST`] is its own affair, such as the silence
-    /// that it wants, and is not made up for. Each of its reads loses that when it has its turn: put off together, those
-    /// with long periods would lose again and again what they have waited.
-    fn let_go(&mut self, index: usize, turns: Time) {
-        let planned = &mut self.reads[index];
-        let (Some(began_at), Some(period)) = (planned.began_at, planned.period) else { return };
-        planned.began_at = Some(began_at + (turns - began_at).saturating_sub(period * BEHIND_MOST));
     }
 
     /// The device turned out to be there by answering the read.
@@ -351,15 +338,6 @@ impl Polls {
             planned.real_period.map(|period| waits.map_or(period, |waits| period.max(waits)))
         };
         of_class.filter_map(lasting).max()
-    }
-
-    /// How much of the time the reads take that come round, if each takes so long.
-    pub fn filled(&self, taken: impl Fn(&Read) -> Duration) -> f64 {
-        let awake = self.reads.iter().filter(|planned| !planned.sleeps);
-        let share = |planned: &Planned| {
-            planned.period.map(|period| taken(&planned.read).as_secs_f64() / period.as_secs_f64().max(1e-6))
-        };
-        awake.filter_map(share).sum()
     }
 
     /// Each read with the period in which it comes round, as far as it does: as wanted, or as long as it

@@ -47,6 +47,13 @@ impl Line {
         counts
     }
 
+    /// After ten seconds.
+    fn that_has_run(polls: &mut Polls, cost: impl Fn(usize) -> Duration) -> Line {
+        let mut line = Line::default();
+        line.run(polls, cost, Time::from_millis(10_000));
+        line
+    }
+
     fn ask(&mut self, polls: &mut Polls, index: usize, cost: Duration) {
         let was_turn = polls.begin(index, self.now, &mut self.pace).was_in_turn();
         polls.end(index);
@@ -101,8 +108,7 @@ fn an_overloaded_bus_stretches_every_period_by_the_same_factor() {
 fn nobody_makes_up_for_a_silence_in_which_all_have_waited() {
     let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
     let cost = |_| Duration::from_millis(60);
-    let mut line = Line::default();
-    line.run(&mut polls, cost, Time::from_millis(10_000));
+    let mut line = Line::that_has_run(&mut polls, cost);
     // The line was silent for ten seconds, and nothing was done meanwhile.
     line.now += Duration::from_secs(10);
     let until = line.now + Duration::from_secs(10);
@@ -115,8 +121,7 @@ fn a_device_that_was_kept_away_takes_no_more_than_its_share_when_it_is_back() {
     for cost in [5, 60] {
         let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
         let cost = |_| Duration::from_millis(cost);
-        let mut line = Line::default();
-        line.run(&mut polls, cost, Time::from_millis(10_000));
+        let mut line = Line::that_has_run(&mut polls, cost);
         polls.pause(0, Time::from_millis(20_000));
         line.run(&mut polls, cost, Time::from_millis(20_000));
         let counts = line.run(&mut polls, cost, Time::from_millis(30_000));
@@ -128,8 +133,7 @@ fn a_device_that_was_kept_away_takes_no_more_than_its_share_when_it_is_back() {
 fn what_was_wanted_at_once_has_its_next_turn_no_later_than_usual() {
     let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
     let cost = |_| Duration::from_millis(60);
-    let mut line = Line::default();
-    line.run(&mut polls, cost, Time::from_millis(10_000));
+    let mut line = Line::that_has_run(&mut polls, cost);
     polls.want(0);
     let until = line.now + Duration::from_millis(600);
     let counts = line.run(&mut polls, cost, until);
@@ -152,9 +156,9 @@ fn nothing_waits_on_a_bus_that_cannot_keep_up_while_nothing_else_is_due() {
 #[test]
 fn what_was_asked_in_vain_is_due_at_once_but_behind_whatever_else_is_due() {
     let mut polls = polls(&[Poll::Fast, Poll::Fast, Poll::Slow]);
-    run(&mut polls, Duration::from_millis(5), Time::from_millis(5_000));
-    let now = Time::from_millis(5_300);
-    let mut pace = Pace::default();
+    let mut line = Line::default();
+    line.run(&mut polls, |_| Duration::from_millis(5), Time::from_millis(5_000));
+    let (now, mut pace) = (Time::from_millis(5_300), line.pace);
     polls.begin(2, now, &mut pace);
     polls.try_again(2, now, false);
     assert_eq!(polls.due_at(pace.at(now)), Some(Time::default()));

@@ -39,17 +39,21 @@ impl Turn {
 impl DeviceState {
     /// When it wants to be asked again.
     pub(in crate::engine::bus) fn due_at(&self, at: Moment) -> Option<Time> {
-        let rested = self.paused_until.max(self.rested_at());
         match self.presence {
-            Presence::Present => self.polls.due_at(at).map(|due| due.max(rested)),
-            _ => Some(rested),
+            Presence::Present => self.polls.due_at(at).map(|due| due.max(self.not_before())),
+            _ => Some(self.not_before()),
         }
     }
 
     /// Whether something is due, and only the silence that it wants is in its way.
     pub(in crate::engine::bus) fn keeps_waiting(&self, at: Moment) -> bool {
         let is_due = || self.polls.due_at(at).is_some_and(|due| due <= at.now);
-        at.now < self.paused_until.max(self.rested_at()) && self.is_present() && is_due()
+        at.now < self.not_before() && self.is_present() && is_due()
+    }
+
+    /// Before, it is not asked because something is due.
+    fn not_before(&self) -> Time {
+        self.paused_until.max(self.rested_at())
     }
 
     /// Before, it wants silence. Others may be asked meanwhile.
@@ -63,8 +67,7 @@ impl DeviceState {
             true => (self.polls.by_period(now), self.polls.wanted()),
             false => (None, 0.0),
         };
-        let not_before = self.paused_until.max(self.rested_at());
-        Outlook { not_before, reads, wanted, served_at: self.served_at }
+        Outlook { not_before: self.not_before(), reads, wanted, served_at: self.served_at }
     }
 
     pub(in crate::engine::bus) fn most_urgent(&self, at: Moment) -> Option<(Polled, Urgency)> {
