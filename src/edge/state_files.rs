@@ -82,22 +82,12 @@ impl StateFiles {
         let recordings = Some(state_dir.join("recordings"));
         let _lock = lock_folder(state_dir)?;
         let mut memories = Memories::default();
-        let mut unknown = Vec::new();
-        for device in devices {
-            match recall(&file_of(&folder, device)) {
-                Ok(Some(memory)) => drop(memories.devices.insert(device.into(), memory)),
-                Ok(None) => unknown.push(device),
-                Err(reason) => memories.unkept = Some(reason),
-            }
-        }
+        let unknown = recall_all(&mut memories, &folder, devices);
         let shown = folder.display();
         if !unknown.is_empty() {
             tracing::info!("nothing is remembered yet in `{shown}` of {}", unknown.join(", "));
         }
-        if memories.unkept.is_none() {
-            memories.unkept =
-                probe(&folder).err().map(|error| format!("`{shown}` cannot be written: {error}"));
-        }
+        memories.unkept = probe(&folder).err().map(|error| format!("`{shown}` cannot be written: {error}"));
         let kept = match &memories.unkept {
             Some(reason) => {
                 tracing::warn!(
@@ -131,21 +121,10 @@ impl StateFiles {
     pub fn learn<'d>(&self, devices: impl Iterator<Item = &'d str>) -> Memories {
         let Some(kept) = &self.kept else { return self.memories() };
         let mut memories = lock(&self.memories);
-        for device in devices {
-            if memories.devices.contains_key(device) || memories.damaged.contains_key(device) {
-                continue;
-            }
-            match recall(&file_of(&kept.folder, device)) {
-                Ok(Some(memory)) => drop(memories.devices.insert(device.into(), memory)),
-                // It may be in use without anything to remember: then that is no news.
-                Ok(None) if lock(&kept.unknown).insert(device.into()) => {
-                    tracing::info!("nothing is remembered yet of {device}");
-                }
-                Ok(None) => {}
-                Err(reason) => {
-                    tracing::warn!("{reason}");
-                    memories.damaged.insert(device.into(), reason);
-                }
+        for device in recall_all(&mut memories, &kept.folder, devices) {
+            // It may be in use without anything to remember: then that is no news.
+            if lock(&kept.unknown).insert(device.into()) {
+                tracing::info!("nothing is remembered yet of {device}");
             }
         }
         memories.clone()
@@ -259,6 +238,30 @@ fn fingerprint(told: &(impl Hash + ?Sized)) -> u64 {
 
 fn file_of(folder: &Path, device: &str) -> PathBuf {
     folder.join(format!("{device}.json"))
+}
+
+/// Reads what is remembered of the devices of which nothing is known yet; returns those of which nothing is found.
+fn recall_all<'d>(
+    memories: &mut Memories,
+    folder: &Path,
+    devices: impl Iterator<Item = &'d str>,
+) -> Vec<&'d str> {
+    let mut unknown = Vec::new();
+    for device in devices {
+        let is_known = memories.devices.contains_key(device) || memories.damaged.contains_key(device);
+        if is_known {
+            continue;
+        }
+        match recall(&file_of(folder, device)) {
+            Ok(Some(memory)) => drop(memories.devices.insert(device.into(), memory)),
+            Ok(None) => unknown.push(device),
+            Err(reason) => {
+                tracing::warn!("{reason}; nothing is kept of {device}");
+                memories.damaged.insert(device.into(), reason);
+            }
+        }
+    }
+    unknown
 }
 
 /// What the file says; `None` if there is none, or none that can be understood: that one is kept
@@ -392,12 +395,20 @@ mod tests {
         is_unkept_alone(files.memories());
         is_unkept_alone(files.learn(["four"].into_iter()));
         // Nor does it take the place of what is remembered elsewhere.
-        let folder = tempfile::tempdir().expect("another folder");
-        let others = StateFiles::open(folder.path(), [].into_iter()).expect("a thread");
+        let elsewhere = tempfile::tempdir().expect("another folder");
+        let others = StateFiles::open(elsewhere.path(), [].into_iter()).expect("a thread");
         others.store(Record { device: "four".into(), memory: memory(9) });
         others.take_over(&files);
         let expected = [("four", memory(9)), ("one", memory(7)), ("two", memory(2))];
         assert_eq!(others.memories().devices, expected.map(|(device, of)| (device.into(), of)).into());
+        // At the next start it is the same: the others are kept.
+        drop(files);
+        let files = StateFiles::open(folder.path(), ["two", "four"].into_iter()).expect("a thread");
+        is_unkept_alone(files.memories());
+        files.store(Record { device: "two".into(), memory: memory(3) });
+        drop(files);
+        let files = StateFiles::open(folder.path(), ["two"].into_iter()).expect("a thread");
+        assert_eq!(files.memories().devices["two"], memory(3));
         drop(files);
         assert!(devices.join("four.json").is_dir(), "it is not overwritten");
     }

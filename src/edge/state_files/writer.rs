@@ -92,8 +92,8 @@ impl Failed {
 }
 
 impl Waiting {
-    /// Whether all of it may wait after such a failure. What is counted of EEPROM waits for no other file: a power
-    /// failure must not undo it.
+    /// Whether all of it may wait after such a failure. What is counted of EEPROM waits for no file but another
+    /// device's: a power failure must not undo it.
     fn may_wait(&self, failed: Failed) -> bool {
         (failed.memories || failed.others && self.memories.is_empty()) && !self.finish
     }
