@@ -35,7 +35,6 @@ type Presence = (bool, Option<String>);
 struct Standing {
     broker: [bool; 4],
     buses: Vec<[bool; 3]>,
-    devices: Vec<Presence>,
     has_configuration_error: bool,
 }
 
@@ -78,23 +77,21 @@ impl Bulletin {
         self.places = places;
         let mut messages = Vec::new();
         let standing = Some(Standing::of(report));
-        if is_due || self.told != standing {
+        let devices: Vec<Presence> = of_devices.iter().map(|(.., device)| presence(device)).collect();
+        if is_due || self.told != standing || self.devices != devices {
             messages.push(Message::retained(topics.bridge_health(), report.to_json().to_string()));
             self.told = standing;
         }
         if is_due {
             self.due = now + TOLD_EVERY;
-            self.devices.clear();
         }
         // What its health says must not be denied for a minute by its availability, nor by the reason in its info.
-        self.devices.resize(of_devices.len(), Presence::default());
-        for ((topic, bus, device), told) in of_devices.into_iter().zip(&mut self.devices) {
-            let found = presence(device);
-            if is_due || *told != found {
-                *told = found;
+        for (index, (topic, bus, device)) in of_devices.into_iter().enumerate() {
+            if is_due || self.devices.get(index) != devices.get(index) {
                 messages.push(Message::retained(topic, device.health_json(&bus.name).to_string()));
             }
         }
+        self.devices = devices;
         let info = Message::retained(topics.bridge_info(), report.info_json(settings).to_string());
         if self.info != info {
             self.info = info.clone();
@@ -129,7 +126,6 @@ impl Standing {
         Standing {
             broker: of_broker(&report.broker),
             buses: buses.map(|bus| [bus.report.up, bus.report.paused, bus.responding]).collect(),
-            devices: report.devices().map(|(_, device)| presence(device)).collect(),
             has_configuration_error: report.configuration_error.is_some(),
         }
     }
