@@ -30,11 +30,7 @@ const LONGER: f64 = HEARTBEATS_WITHIN / (HEARTBEATS_WITHIN - 1.0);
 /// What the bus does to a device's patience, in seconds.
 #[derive(Clone, Copy)]
 pub struct Delays {
-    /// The longest time between two requests to this device; none where nothing is polled.
-    asked_every: Option<f64>,
-    /// The longest that was seen to pass between two, where the bus cannot keep up: there a round of everything else
-    /// between two polls is not the most.
-    pub waited_for: f64,
+    asked: Asked,
     /// The request that is on the wire when something comes; and all that is read again and again, once.
     one_request: f64,
     round: f64,
@@ -52,15 +48,19 @@ pub struct Delays {
     is_line: bool,
 }
 
+/// How often a device is asked by its polls, in seconds.
+#[derive(Clone, Copy)]
+pub struct Asked {
+    /// The longest time between two requests; none where nothing is polled.
+    pub every: Option<f64>,
+    /// The longest that was seen to pass between two, where the bus cannot keep up: there a round of everything else
+    /// between two polls is not the most.
+    pub waited_for: f64,
+}
+
 impl Delays {
     /// `device` is its number on the bus.
-    pub fn of(
-        bus: &Bus,
-        settings: &DeviceSettings,
-        device: usize,
-        asked_every: Option<f64>,
-        budget: &Budget,
-    ) -> Delays {
+    pub fn of(bus: &Bus, settings: &DeviceSettings, device: usize, asked: Asked, budget: &Budget) -> Delays {
         let others = budget.wants.iter().enumerate().filter(|(other, _)| *other != device);
         let fed = |wants: &Wants| wants.fed_every.map_or(0.0, |_| budget.longest()) + wants.time_of_beats();
         let demanded = settings.device.wire.response_timeout.unwrap_or_default();
@@ -71,8 +71,7 @@ impl Delays {
         let reads = reads.map(|other| budget.asked_again_and_again(other)).max().unwrap_or_default();
         let all_silent = all_silent(budget, reads, timeout, is_line).max(one_silent);
         Delays {
-            asked_every,
-            waited_for: 0.0,
+            asked,
             one_request: budget.longest(),
             round: budget.round(),
             others_fed: others.map(|(_, wants)| fed(wants)).sum(),
@@ -152,10 +151,11 @@ pub fn of_device(settings: &DeviceSettings, delays: Delays) -> Vec<Feeding> {
         let due = time.filter(|time| *time > 0.0).map_or(f64::INFINITY, |time| time / HEARTBEATS_WITHIN);
         // Otherwise one may be on the wire and everything else be due when it is due, and the device that
         // is silent among that.
-        let asked_every = delays.asked_every.unwrap_or(f64::INFINITY);
-        let polled_every = (asked_every + delays.round).max(delays.waited_for) + delays.one_request;
+        let Asked { every, waited_for } = delays.asked;
+        let every = every.unwrap_or(f64::INFINITY);
+        let polled_every = (every + delays.round).max(waited_for) + delays.one_request;
         // Behind a silence there may be such a round as well.
-        let uneven = asked_every.max(delays.waited_for) + delays.round + delays.one_request;
+        let uneven = every.max(waited_for) + delays.round + delays.one_request;
         let polled_every_one_silent = uneven + delays.all_silent;
         let [before, before_one_silent] =
             [delays.one_request, delays.one_silent].map(|delay| delay + delays.others_fed);

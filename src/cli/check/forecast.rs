@@ -34,8 +34,8 @@ pub struct Forecast {
     pub load: f64,
     /// By device and class: how often it is really read, where that is told.
     periods: BTreeMap<(usize, Poll), f64>,
-    /// By device: the longest time from one request to the next that was seen.
-    waits: Vec<f64>,
+    /// By unit: the longest time from one request to the next that was seen.
+    waits: BTreeMap<u8, f64>,
 }
 
 impl Forecast {
@@ -58,10 +58,10 @@ impl Forecast {
         self.periods.get(&(device, poll)).copied().unwrap_or(wanted * self.load.max(1.0))
     }
 
-    /// The longest time from one request to this device to the next, as far as it was seen, where the bus cannot keep
+    /// The longest time from one request to this unit to the next, as far as it was seen, where the bus cannot keep
     /// up: how unevenly a read has its turns there no sum tells.
-    pub fn waits_unevenly(&self, device: usize) -> f64 {
-        if self.load > 1.0 { self.waits[device] } else { 0.0 }
+    pub fn waits_unevenly(&self, unit: u8) -> f64 {
+        if self.load > 1.0 { self.waits.get(&unit).copied().unwrap_or_default() } else { 0.0 }
     }
 }
 
@@ -94,13 +94,12 @@ fn count(rehearsal: &mut Rehearsal, devices: &[&DeviceSettings], budget: &Budget
     }
     let share = (rehearsal.busy - busy).as_secs_f64() / (rehearsal.now - begin).as_secs_f64();
 
-    let wait = |device: &&DeviceSettings| {
-        let times = || rehearsal.asked.iter().filter(|asked| asked.unit == device.unit).map(|asked| asked.at);
-        times().zip(times().skip(1)).map(|(one, next)| (next - one).as_secs_f64()).fold(0.0, f64::max)
-    };
-    let waits = devices.iter().map(wait).collect();
     let mut times: BTreeMap<(u8, Span), Seen> = BTreeMap::new();
+    let mut waits: BTreeMap<u8, (Time, Duration)> = BTreeMap::new();
     for asked in rehearsal.asked.drain(..) {
+        let (last, longest) = waits.entry(asked.unit).or_insert((asked.at, Duration::ZERO));
+        *longest = (asked.at - *last).max(*longest);
+        *last = asked.at;
         if let Call::Read(span) = asked.call {
             let seen =
                 times.entry((asked.unit, span)).or_insert(Seen { first: asked.at, last: asked.at, count: 0 });
@@ -119,6 +118,7 @@ fn count(rehearsal: &mut Rehearsal, devices: &[&DeviceSettings], budget: &Budget
         *of_class = of_class.max(*real);
     }
     let load = if share > NEVER_DONE { stretch(&told).max(share) } else { share };
+    let waits = waits.into_iter().map(|(unit, (_, longest))| (unit, longest.as_secs_f64())).collect();
     Forecast { load, periods, waits }
 }
 
