@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use anyhow::{Context, anyhow};
 
 use super::characters::Characters;
-use super::{Failure, configuration, profiles};
+use super::{Failure, configuration, profiles, reach};
 use crate::edge::clock::Clock;
 use crate::edge::guarded_link::GuardedLink;
-use crate::edge::link::{Link, Lost};
+use crate::edge::link::Link;
 use crate::engine::address::Span;
 use crate::engine::codec::{self, Raw};
 use crate::engine::command::{CommandFlow, Outcome, Step, words_of};
@@ -17,7 +17,7 @@ use crate::engine::identity::{self, Interview};
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Answer, Call, Request, RequestError};
 use crate::engine::profile::Library;
-use crate::engine::settings::{self, Line, Rs485};
+use crate::engine::settings;
 use crate::engine::time::Duration;
 use crate::engine::yaml::Scalar;
 
@@ -76,16 +76,6 @@ pub struct Addressee {
     pub device: Option<Device>,
 }
 
-/// One port or address, opened with one line's settings after the other.
-pub struct Reach {
-    link: settings::Link,
-    clock: Clock,
-    /// Silence behind each opening.
-    pub connect_delay: Duration,
-    /// With the settings that it was opened with.
-    open: Option<(Option<Line>, GuardedLink)>,
-}
-
 /// A question's fate: the device's word, or why there is none.
 type Answered = Result<Answer, RequestError>;
 
@@ -94,7 +84,9 @@ impl ByHand {
     pub fn open(&self) -> Result<Asked, Failure> {
         let line = self.characters.line();
         let WhichLine { serial, tcp, rtu_over_tcp, .. } = &self.line;
-        let Some(link) = link([serial, tcp, rtu_over_tcp], line)? else { return self.open_configured() };
+        let Some(link) = reach::link([serial, tcp, rtu_over_tcp], line)? else {
+            return self.open_configured();
+        };
         let unit = self.unit.unwrap_or_default();
         let most = link.units_most();
         if unit > most {
@@ -136,37 +128,6 @@ fn open(link: &settings::Link, gap: Option<Duration>, whom: Addressee) -> Result
     Ok(Asked { link, broadcasts, whom })
 }
 
-/// The link that is named by `--serial`, `--tcp` or `--rtu-over-tcp`, in this order; `None`: none is.
-pub fn link(
-    [serial, tcp, rtu_over_tcp]: [&Option<String>; 3],
-    line: Line,
-) -> Result<Option<settings::Link>, Failure> {
-    Ok(Some(match (serial, tcp, rtu_over_tcp) {
-        (Some(path), ..) => settings::Link::Serial { path: path.clone(), line, rs485: Rs485::Auto },
-        (_, Some(address), _) => {
-            let (host, port) = host_and_port(address)?;
-            settings::Link::Tcp { host, port }
-        }
-        (.., Some(address)) => {
-            let (host, port) = host_and_port(address)?;
-            settings::Link::RtuOverTcp { host, port, line }
-        }
-        _ => return Ok(None),
-    }))
-}
-
-fn host_and_port(address: &str) -> Result<(String, u16), Failure> {
-    match address.rsplit_once(':') {
-        Some((host, port)) if !host.is_empty() && (!host.contains(':') || host.ends_with(']')) => {
-            let number =
-                port.parse().map_err(|_| Failure::wrong(format!("`{port}` in `{address}` is no port")))?;
-            Ok((host.trim_matches(['[', ']']).to_owned(), number))
-        }
-        None if !address.is_empty() => Ok((address.to_owned(), 502)),
-        _ => Err(Failure::wrong(format!("`{address}` is no address; expected one like `192.168.1.20:502`"))),
-    }
-}
-
 impl Addressee {
     /// One question. `Err` outside: the line is lost, or it cannot be asked.
     pub fn ask(&self, link: &mut GuardedLink, call: &Call) -> Result<Answered, Failure> {
@@ -185,43 +146,6 @@ impl Addressee {
     }
 }
 
-impl Reach {
-    pub fn new(link: settings::Link, clock: Clock) -> Reach {
-        Reach { link, clock, connect_delay: Duration::ZERO, open: None }
-    }
-
-    /// The link, open with these settings (of Modbus TCP none) and strict about parity.
-    pub fn at(&mut self, line: Option<Line>) -> Result<&mut GuardedLink, Lost> {
-        // What is open with others is closed first, since a port is open only once.
-        let open = match self.open.take().filter(|(open, _)| *open == line) {
-            Some(open) => open,
-            None => (line, self.opened(line)?),
-        };
-        Ok(&mut self.open.insert(open).1)
-    }
-
-    /// The settings that it is open with; `None`: it is not.
-    pub fn open_with(&self) -> Option<Option<Line>> {
-        self.open.as_ref().map(|(line, _)| *line)
-    }
-
-    /// Forgets a link that is of no use any more.
-    pub fn close(&mut self) {
-        self.open = None;
-    }
-
-    fn opened(&self, line: Option<Line>) -> Result<GuardedLink, Lost> {
-        use settings::Link::{RtuOverTcp, Serial};
-        let mut link = self.link.clone();
-        if let (Serial { line: set, .. } | RtuOverTcp { line: set, .. }, Some(line)) = (&mut link, line) {
-            *set = line;
-        }
-        let opened = Link::open_strict(&link)?;
-        std::thread::sleep(self.connect_delay);
-        Ok(GuardedLink::new(opened, Guard::new(&link, None), self.clock))
-    }
-}
-
 impl Asked {
     pub fn unit(&self) -> u8 {
         self.whom.unit
@@ -237,7 +161,7 @@ impl Asked {
         self.unit() == 0 && self.broadcasts
     }
 
-    /// One question. `Err` outside: the line is lost.
+    /// One question. `Err` outside: the line is lost, or it cannot be asked.
     pub fn ask(&mut self, call: &Call) -> Result<Answered, Failure> {
         self.whom.ask(&mut self.link, call)
     }
@@ -354,20 +278,4 @@ pub fn span(text: &str) -> Option<Result<Span, Failure>> {
     let word = text.split_whitespace().next().unwrap_or_default();
     let is_address = text.contains(' ') || crate::engine::address::Table::from_name(word).is_some();
     is_address.then(|| <Span as Scalar>::parse(text).map_err(Failure::wrong))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_address_is_a_host_and_perhaps_a_port() {
-        let parts = |text: &str| host_and_port(text).ok();
-        assert_eq!(parts("192.168.1.20:1502"), Some(("192.168.1.20".into(), 1502)));
-        assert_eq!(parts("plc.local"), Some(("plc.local".into(), 502)));
-        assert_eq!(parts("[::1]:502"), Some(("::1".into(), 502)));
-        for wrong in ["", ":502", "host:port", "host:70000", "::1"] {
-            assert_eq!(parts(wrong), None, "{wrong}");
-        }
-    }
 }

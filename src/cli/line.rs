@@ -4,7 +4,8 @@ use std::io::{self, BufRead, IsTerminal};
 
 use anyhow::anyhow;
 
-use super::by_hand::{Addressee, Reach};
+use super::by_hand::Addressee;
+use super::reach::Reach;
 use super::{Failure, output, profiles};
 use crate::edge::clock::Clock;
 use crate::edge::link::Lost;
@@ -20,9 +21,10 @@ use crate::engine::yaml::Scalar;
 /// Change the bit rate and parity of one device
 ///
 /// Asks the device who it is with the settings that it has (--baud and --parity), looks into its profile for
-/// how they are set, asks for a yes, and writes once. Then the device has to answer with the new settings;
-/// where it does not, it is looked for with the old ones, and told is in which state it is. Never goes to
-/// more than one device. Nobody else may speak on the line meanwhile: stop the service first.
+/// how they are set, looks whether the port takes the new ones, asks for a yes, asks the device once more,
+/// and writes once. Then the device has to answer with the new settings; where it does not, it is looked for
+/// with the old ones, and told is in which state it is. Never goes to more than one device. Nobody else may
+/// speak on the line meanwhile: stop the service first.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:
   busker line --serial /dev/ttyUSB0 --baud 9600 --parity none --unit 18 --set 19200,even --yes")]

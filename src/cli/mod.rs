@@ -24,6 +24,7 @@ pub mod log;
 pub mod output;
 mod plan;
 mod profiles;
+mod reach;
 mod read;
 mod run;
 mod scan;

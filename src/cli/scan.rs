@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::anyhow;
 
-use super::by_hand::{self, Reach};
+use super::reach::{self, Reach};
 use super::{Failure, output};
 use crate::edge::clock::Clock;
 use crate::edge::link::{Lost, adapter};
@@ -126,7 +126,7 @@ impl Args {
     /// What is scanned, with any settings: it is opened with those of each question.
     fn link(&self) -> Result<Link, Failure> {
         let WhichLine { serial, tcp, rtu_over_tcp } = &self.line;
-        let link = by_hand::link([serial, tcp, rtu_over_tcp], scan::SPECIFIED)?;
+        let link = reach::link([serial, tcp, rtu_over_tcp], scan::SPECIFIED)?;
         link.ok_or_else(|| Failure::wrong("expected `--serial`, `--tcp` or `--rtu-over-tcp`"))
     }
 
@@ -148,7 +148,10 @@ impl Args {
         };
         let mut units = BTreeSet::new();
         for part in text.split(',') {
-            units.extend(settings::units(part.trim(), most).map_err(Failure::wrong)?);
+            units.extend(
+                settings::units(part.trim(), most)
+                    .map_err(|why| Failure::wrong(format!("`--units`: {why}")))?,
+            );
         }
         Ok(units.into_iter().collect())
     }
