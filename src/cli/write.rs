@@ -6,11 +6,9 @@ use super::by_hand::{Asked, ByHand, span};
 use super::read::as_text;
 use super::{Failure, output};
 use crate::engine::address::{Span, Table};
-use crate::engine::command::{
-    ACCEPTED, ACKNOWLEDGE, BUSY_MAX, CommandFlow, OutcomeKind, PAUSE_BUSY, words_of,
-};
+use crate::engine::command::{ACCEPTED, BUSY_MAX, CommandFlow, OutcomeKind, PAUSE_BUSY, words_of};
 use crate::engine::device::Order;
-use crate::engine::modbus::{Answer, Call, RequestError};
+use crate::engine::modbus::{ACKNOWLEDGE, Answer, Call, RequestError};
 use crate::engine::yaml::Scalar;
 
 /// Write to one device by hand, and read back what it holds then

@@ -14,7 +14,7 @@ pub use wish::Wish;
 use crate::engine::address::{Address, Span};
 use crate::engine::codec;
 use crate::engine::device::{Device, Names, Point, PointIndex, Write, WriteFunction, WriteRule};
-use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
+use crate::engine::modbus::{ACKNOWLEDGE, Answer, BUSY, Call, ILLEGAL_VALUE, RequestError, exception_name};
 use crate::engine::time::Duration;
 use crate::engine::transaction::Transaction;
 
@@ -32,12 +32,6 @@ pub struct CommandFlow {
     busy: u32,
 }
 
-/// The exception of a device that does not take the value. Some say so, too, when they take the nearest one.
-pub const ILLEGAL_VALUE: u8 = 3;
-/// "Accepted, and it will take long": the exception that says nothing is wrong.
-pub const ACKNOWLEDGE: u8 = 5;
-/// The device has done nothing, and wants to be asked again.
-pub const BUSY: u8 = 6;
 pub const ACCEPTED: &str = "the device has accepted it, and takes its time (exception 5, acknowledge)";
 /// A device that is busy is asked again after this, and so often.
 pub const PAUSE_BUSY: Duration = Duration::from_millis(200);

@@ -7,7 +7,7 @@
 
 use crate::engine::device::{Device, Identify, LineControl, SettingsBy, SettingsRegister};
 use crate::engine::identity::{Interview, check, question};
-use crate::engine::modbus::{Answer, Call, RequestError};
+use crate::engine::modbus::{ACKNOWLEDGE, Answer, BUSY, Call, RequestError};
 use crate::engine::settings::{Line, Parity};
 
 /// Why nothing is written.
@@ -33,10 +33,7 @@ pub struct LineChange {
 /// The profile that the device is sure to have, by its own word. `given` is the one that a person names.
 pub fn profile_of<'a>(interview: &'a Interview, given: Option<&'a Device>) -> Result<&'a str, Refusal> {
     if !interview.was_heard() {
-        return Err(Refusal::Device(format!(
-            "it does not answer with these settings: {}; `busker scan --serial PORT --units UNIT` finds those that it has",
-            interview.why_unheard()
-        )));
+        return Err(unheard(interview));
     }
     let fitting = interview.fitting();
     match (given, &fitting[..]) {
@@ -58,6 +55,13 @@ pub fn profile_of<'a>(interview: &'a Interview, given: Option<&'a Device>) -> Re
             Err(Refusal::Device(format!("it may be {}; name it with `--profile`", ids.join(" or "))))
         }
     }
+}
+
+fn unheard(interview: &Interview) -> Refusal {
+    Refusal::Device(format!(
+        "it does not answer with these settings: {}; `busker scan --serial PORT --units UNIT` finds those that it has",
+        interview.why_unheard()
+    ))
 }
 
 /// What sets the device's unit, which no device here lets a register do.
@@ -93,12 +97,11 @@ impl LineChange {
         }
         let call = Call::WriteRegister { address: register.at.first(), word };
         let identify = device.identify.clone();
-        // Whoever tells nobody who it is answers this one all the same, if only by a refusal; there are
-        // devices that are silent to all that they do not know.
-        let names = || Call::ReadIdentification { code: 1, object: 0 };
+        // A device that tells nobody who it is gives the answer that it has given, if only a refusal; there are those
+        // that are silent to all that they do not know.
         let who = match &identify {
             Some(identify) => question(identify),
-            None => interview.heard_by().cloned().unwrap_or_else(names),
+            None => interview.heard_by().cloned().ok_or_else(|| unheard(interview))?,
         };
         Ok(Some(LineChange { identify, who, from, to, call }))
     }
@@ -126,7 +129,7 @@ impl LineChange {
             (Ok(answer), Some(identify)) => Ok(check(identify, answer).map(drop)),
             (Ok(_) | Err(RequestError::Exception(_)), None) => Ok(Ok(())),
             // Whoever is busy does not say who it is.
-            (Err(busy @ RequestError::Exception(5 | 6)), _) => Err(busy),
+            (Err(busy @ RequestError::Exception(ACKNOWLEDGE | BUSY)), _) => Err(busy),
             (Err(error @ RequestError::Exception(_)), _) => Ok(Err(format!("it answers with {error}"))),
             (Err(error), _) => Err(error),
         }

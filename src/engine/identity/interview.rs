@@ -234,8 +234,13 @@ impl Interview {
 
     /// Why nothing was heard, and where to look.
     pub fn why_unheard(&self) -> String {
-        let error = self.objects_error.as_ref().unwrap_or(&RequestError::Timeout);
+        let error = self.silence();
         format!("{error}{}", error.advice())
+    }
+
+    /// The fate of the first question, where nothing was heard.
+    pub fn silence(&self) -> &RequestError {
+        self.objects_error.as_ref().unwrap_or(&RequestError::Timeout)
     }
 
     /// The objects by their names, as programs are told them.

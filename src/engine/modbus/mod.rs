@@ -20,6 +20,13 @@ use crate::engine::address::Span;
 use crate::engine::time::{Duration, Time};
 pub use crate::engine::value::exception_name;
 
+/// The exception of a device that does not take the value. Some say so, too, when they take the nearest one.
+pub const ILLEGAL_VALUE: u8 = 3;
+/// "Accepted, and it will take long": the exception that says nothing is wrong.
+pub const ACKNOWLEDGE: u8 = 5;
+/// The device has done nothing, and wants to be asked again.
+pub const BUSY: u8 = 6;
+
 /// One question to one unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {

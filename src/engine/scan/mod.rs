@@ -380,7 +380,7 @@ impl Scan {
             // It has answered, and then no more.
             self.look_again(unit, LOOKS_AGAIN);
         } else {
-            self.give_up(unit, interview.objects_error().cloned().unwrap_or(RequestError::Timeout));
+            self.give_up(unit, interview.silence().clone());
         }
     }
 

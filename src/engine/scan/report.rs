@@ -71,7 +71,7 @@ impl Report {
         }
         let _ = write!(text, "buses:\n  {bus}:\n    {}\n", key_of(link));
         if let Some(Line { baud, parity, stop_bits }) = self.scan.settled.flatten() {
-            let _ = write!(text, "    baud: {baud}\n    parity: {}\n", parity);
+            let _ = writeln!(text, "    baud: {baud}\n    parity: {parity}");
             if stop_bits != 1 {
                 let _ = writeln!(text, "    stop_bits: {stop_bits}");
             }

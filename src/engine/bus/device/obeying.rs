@@ -1,9 +1,9 @@
 //! What a device does with commands: which it can take, what is asked for them, and what follows.
 
 use crate::engine::codec;
-use crate::engine::command::{BUSY, CommandFlow, Outcome, OutcomeKind};
+use crate::engine::command::{CommandFlow, Outcome, OutcomeKind};
 use crate::engine::device::PointIndex;
-use crate::engine::modbus::{Answer, RequestError};
+use crate::engine::modbus::{Answer, BUSY, RequestError};
 use crate::engine::plan::Read;
 use crate::engine::time::Time;
 use crate::engine::yaml::nearest;

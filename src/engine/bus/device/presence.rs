@@ -1,9 +1,8 @@
 //! Whether a device is there: how it comes and goes, and what its silence and its late answers say.
 
-use crate::engine::command::{ACKNOWLEDGE, BUSY};
 use crate::engine::homeassistant;
 use crate::engine::identity;
-use crate::engine::modbus::{Answer, Discarded, Reply, RequestError};
+use crate::engine::modbus::{ACKNOWLEDGE, Answer, BUSY, Discarded, Reply, RequestError};
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::Missing;
 

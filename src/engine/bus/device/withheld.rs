@@ -4,9 +4,8 @@
 //! Such a read is not the device's end. It is asked ever less often, so that waiting for it costs the bus
 //! little; its points say `None` and why; and the device is online with the rest.
 
-use crate::engine::command::{ACKNOWLEDGE, BUSY};
 use crate::engine::device::Poll;
-use crate::engine::modbus::RequestError;
+use crate::engine::modbus::{ACKNOWLEDGE, BUSY, RequestError};
 use crate::engine::time::{Duration, Time};
 use crate::engine::value::Missing;
 

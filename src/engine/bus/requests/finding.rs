@@ -37,7 +37,7 @@ impl Identification {
         if interview.was_heard() {
             return Progress::done(data);
         }
-        let error = interview.objects_error().unwrap_or(&RequestError::Timeout).to_string();
+        let error = interview.silence().to_string();
         Progress::Done { status: Status::Error, data, error: Some(error) }
     }
 }

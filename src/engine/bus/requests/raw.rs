@@ -5,9 +5,9 @@ use serde_json::json;
 use crate::engine::address::{Span, Table};
 use crate::engine::bus::Context;
 use crate::engine::bus::device::DeviceState;
-use crate::engine::command::{ACCEPTED, ACKNOWLEDGE, BUSY, BUSY_MAX, ILLEGAL_VALUE, PAUSE_BUSY, words_of};
+use crate::engine::command::{ACCEPTED, BUSY_MAX, PAUSE_BUSY, words_of};
 use crate::engine::device::{PointIndex, WriteFunction};
-use crate::engine::modbus::{Answer, Call, RequestError, exception_name};
+use crate::engine::modbus::{ACKNOWLEDGE, Answer, BUSY, Call, ILLEGAL_VALUE, RequestError, exception_name};
 use crate::engine::request::Status;
 use crate::engine::time::{Duration, Time};
 

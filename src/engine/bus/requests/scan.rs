@@ -119,11 +119,9 @@ impl Bus {
         if scanning.interview.was_heard() {
             let unit = scanning.unit;
             let bus = &self.name;
-            let only = scanning.interview.only_fitting();
-            let profile = only.as_ref().map(|(profile, _)| *profile);
+            let (profile, told) = scanning.interview.only_fitting().unzip();
             let proposal =
                 profile.map(|profile| format!("{}: {}", name_for(profile, unit), entry(profile, bus, unit)));
-            let told = only.as_ref().map(|(_, told)| told.clone());
             let identity = told.or_else(|| scanning.interview.names());
             scanning.found.push(json!({
                 "unit": unit,
