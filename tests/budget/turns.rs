@@ -232,7 +232,7 @@ fn fault_of(case: &Case) -> Result<(), TestCaseError> {
         line.run_for(1_000).map_err(fail)?;
     }
     let times = times(&mut line);
-    case.look_for_starving(&times, [from, line.now], Unit::cost).map_err(fail)?;
+    case.look_for_starving(&times, [from, line.now], None, Unit::cost).map_err(fail)?;
     case.look_for_unfairness(&times).map_err(fail)
 }
 
@@ -305,57 +305,47 @@ impl Case {
             _ => 0,
         };
         let (number, unit) = ((unit % count + 1) as u8, &self.units[unit % count]);
-        let mut times = times(line);
+        let times = times(line);
         let span = [from, line.now];
         match trouble {
             // Each read comes behind eight others.
             Trouble::Commands(_) | Trouble::SomeCommands(..) | Trouble::Gets(..) => {
                 let of_others = AHEAD * (unit.rest() + unit.cost());
-                self.look_for_starving(&times, span, |of| of.cost() + of_others)
+                self.look_for_starving(&times, span, None, |of| of.cost() + of_others)
             }
-            Trouble::Slow(_) => self.look_for_starving(&times, span, |of| of.cost() * SLOWER as f64),
-            Trouble::Nothing => self.look_for_starving(&times, span, Unit::cost),
+            Trouble::Slow(_) => self.look_for_starving(&times, span, None, |of| of.cost() * SLOWER as f64),
+            Trouble::Nothing => self.look_for_starving(&times, span, None, Unit::cost),
             Trouble::Leaves(_) | Trouble::Refuses(..) => {
-                times.retain(|(of, _), _| *of != number);
                 // What is busy is asked again soon, before all others.
                 let is_busy = matches!(trouble, Trouble::Refuses(_, 5 | 6));
                 let of_others = if is_busy { AHEAD * unit.cost() } else { 0.0 };
-                self.look_for_starving(&times, span, |of| of.cost() + of_others)
+                self.look_for_starving(&times, span, Some(number), |of| of.cost() + of_others)
             }
-            Trouble::Collisions(_) => self.look_for_starving(&times, span, |of| of.cost() + COLLISION),
+            Trouble::Collisions(_) => self.look_for_starving(&times, span, None, |of| of.cost() + COLLISION),
             // Others have to wait for its silence, and it is asked as seldom as it pleases.
             Trouble::Dead(_) | Trouble::Breaks(_) => Ok(()),
         }
     }
 
-    /// Each read that is asked at all has its turn within a few times what would be its share of the wire.
+    /// Each read has its turn within a few times what would be its share of the wire, but for those of a unit that is
+    /// away, or refuses them. One that is never asked has waited all the time.
     fn look_for_starving(
         &self,
         times: &Times,
         [from, until]: [Time; 2],
+        away: Option<u8>,
         cost: impl Fn(&Unit) -> f64,
     ) -> Result<(), String> {
         let load = self.load(&cost).max(1.0);
         let round: f64 = self.units.iter().map(|unit| unit.count() * cost(unit)).sum();
-        for (read, period) in self.periods() {
-            let Some(asked) = times.get(&read) else {
-                if self.is_left_out(times, read.0) {
-                    continue;
-                }
-                let waited = (until - from).as_secs_f64();
-                self.within(read, waited, period, load, round)?;
-                continue;
-            };
-            let moments: Vec<Time> = [from].into_iter().chain(asked.iter().copied()).chain([until]).collect();
+        for (read, period) in self.periods().into_iter().filter(|(read, _)| Some(read.0) != away) {
+            let asked = times.get(&read).into_iter().flatten().copied();
+            let moments: Vec<Time> = [from].into_iter().chain(asked).chain([until]).collect();
             let longest =
                 moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).fold(0.0, f64::max);
             self.within(read, longest, period, load, round)?;
         }
         Ok(())
-    }
-
-    fn is_left_out(&self, times: &Times, unit: u8) -> bool {
-        !times.keys().any(|(of, _)| *of == unit)
     }
 
     fn within(&self, read: (u8, u16), waited: f64, period: f64, load: f64, round: f64) -> Result<(), String> {
