@@ -51,6 +51,22 @@ enum Trouble {
     Leaves(usize),
 }
 
+impl Trouble {
+    /// Whom it befalls, if not all: any number, which stands for one of those that there are.
+    fn unit(self) -> Option<usize> {
+        match self {
+            Trouble::Commands(unit)
+            | Trouble::SomeCommands(unit, _)
+            | Trouble::Gets(unit, _)
+            | Trouble::Dead(unit)
+            | Trouble::Refuses(unit, _)
+            | Trouble::Slow(unit)
+            | Trouble::Leaves(unit) => Some(unit),
+            Trouble::Nothing | Trouble::Collisions(_) | Trouble::Breaks(_) => None,
+        }
+    }
+}
+
 #[derive(Clone, Debug)]
 struct Case {
     is_network: bool,
@@ -143,7 +159,7 @@ impl Case {
                 unit.fast,
                 unit.slow,
                 unit.rest,
-                number = index + 1,
+                number = number_of(index),
             );
         }
         text
@@ -153,7 +169,7 @@ impl Case {
     fn periods(&self) -> BTreeMap<(u8, u16), f64> {
         let mut periods = BTreeMap::new();
         for (index, unit) in self.units.iter().enumerate() {
-            let place = |from: u16, number: u16| (index as u8 + 1, from + number * APART);
+            let place = |from: u16, number: u16| (number_of(index), from + number * APART);
             let fast = (0..unit.fast_reads).map(|number| (place(0, number), unit.fast as f64 / 1e3));
             let slow = (0..unit.slow_reads).map(|number| (place(SLOW_FROM, number), unit.slow as f64 / 1e3));
             periods.extend(fast.chain(slow));
@@ -188,6 +204,11 @@ impl Unit {
     }
 }
 
+/// That of the unit at this place in the list.
+fn number_of(place: usize) -> u8 {
+    place as u8 + 1
+}
+
 /// By unit and address, when it was asked.
 type Times = BTreeMap<(u8, u16), Vec<Time>>;
 
@@ -215,8 +236,11 @@ fn fault_of(case: &Case) -> Result<(), TestCaseError> {
     line.run_for(SETTLES).map_err(fail)?;
     for (trouble, lasts) in &case.troubles {
         line.asked.clear();
-        case.run_troubled(&mut line, *trouble, *lasts)
-            .map_err(|text| fail(format!("{trouble:?}: {text}")))?;
+        let from = line.now;
+        let outcome = case.perform(&mut line, *trouble, *lasts);
+        let span = [from, line.now];
+        let outcome = outcome.and_then(|()| case.judge(*trouble, &times(&mut line), span));
+        outcome.map_err(|text| fail(format!("{trouble:?}: {text}")))?;
         // A device that is away, or refuses something, is asked again only so often.
         if matches!(trouble, Trouble::Dead(_) | Trouble::Refuses(..) | Trouble::Breaks(_)) {
             line.run_for(FORGOTTEN).map_err(fail)?;
@@ -239,43 +263,43 @@ fn fault_of(case: &Case) -> Result<(), TestCaseError> {
 const REQUESTS: usize = 4_000;
 
 impl Case {
-    fn run_troubled(&self, line: &mut Plain, trouble: Trouble, lasts: u64) -> Result<(), String> {
-        let count = self.units.len();
-        let from = line.now;
-        let until = from + Duration::from_millis(lasts);
+    /// Lets it befall the bus for so many milliseconds.
+    fn perform(&self, line: &mut Plain, trouble: Trouble, lasts: u64) -> Result<(), String> {
+        let unit = self.befallen_by(trouble);
+        let until = line.now + Duration::from_millis(lasts);
         match trouble {
             Trouble::Nothing => line.run_for(lasts)?,
-            Trouble::Commands(unit) => {
-                line.flood = Some(unit % count);
+            Trouble::Commands(_) => {
+                line.flood = Some(unit);
                 line.run_for(lasts)?;
                 line.flood = None;
             }
-            Trouble::SomeCommands(unit, every) => {
+            Trouble::SomeCommands(_, every) => {
                 while line.now < until {
-                    line.command(unit % count);
+                    line.command(unit);
                     line.run_for(every)?;
                 }
             }
-            Trouble::Gets(unit, every) => {
+            Trouble::Gets(_, every) => {
                 while line.now < until {
-                    line.get(unit % count, "fast0");
+                    line.get(unit, "fast0");
                     line.run_for(every)?;
                 }
             }
-            Trouble::Dead(unit) => {
-                line.dead = Some(unit % count);
+            Trouble::Dead(_) => {
+                line.dead = Some(unit);
                 line.run_for(lasts)?;
                 line.dead = None;
             }
-            Trouble::Refuses(unit, code) => {
-                line.refuses = Some((unit % count, code));
+            Trouble::Refuses(_, code) => {
+                line.refuses = Some((unit, code));
                 line.run_for(lasts)?;
                 line.refuses = None;
             }
-            Trouble::Slow(unit) => {
-                line.costs[unit % count] *= SLOWER;
+            Trouble::Slow(_) => {
+                line.costs[unit] *= SLOWER;
                 line.run_for(lasts)?;
-                line.costs[unit % count] /= SLOWER;
+                line.costs[unit] /= SLOWER;
             }
             Trouble::Collisions(each) => {
                 line.collides_each = Some(each);
@@ -288,43 +312,42 @@ impl Case {
                     line.run_for(every)?;
                 }
             }
-            Trouble::Leaves(unit) => {
-                line.retire(unit % count);
+            Trouble::Leaves(_) => {
+                line.retire(unit);
                 line.run_for(lasts)?;
-                line.adopt(unit % count);
+                line.adopt(unit);
             }
         }
-        let unit = match trouble {
-            Trouble::Commands(unit)
-            | Trouble::SomeCommands(unit, _)
-            | Trouble::Gets(unit, _)
-            | Trouble::Dead(unit)
-            | Trouble::Refuses(unit, _)
-            | Trouble::Slow(unit)
-            | Trouble::Leaves(unit) => unit,
-            _ => 0,
-        };
-        let (number, unit) = ((unit % count + 1) as u8, &self.units[unit % count]);
-        let times = times(line);
-        let span = [from, line.now];
+        Ok(())
+    }
+
+    /// Whether everybody had turns while it lasted, by what was asked then.
+    fn judge(&self, trouble: Trouble, times: &Times, span: [Time; 2]) -> Result<(), String> {
+        let befallen = self.befallen_by(trouble);
+        let unit = &self.units[befallen];
         match trouble {
             // Each read comes behind eight others.
             Trouble::Commands(_) | Trouble::SomeCommands(..) | Trouble::Gets(..) => {
                 let of_others = AHEAD * (unit.rest() + unit.cost());
-                self.look_for_starving(&times, span, None, |of| of.cost() + of_others)
+                self.look_for_starving(times, span, None, |of| of.cost() + of_others)
             }
-            Trouble::Slow(_) => self.look_for_starving(&times, span, None, |of| of.cost() * SLOWER as f64),
-            Trouble::Nothing => self.look_for_starving(&times, span, None, Unit::cost),
+            Trouble::Slow(_) => self.look_for_starving(times, span, None, |of| of.cost() * SLOWER as f64),
+            Trouble::Nothing => self.look_for_starving(times, span, None, Unit::cost),
             Trouble::Leaves(_) | Trouble::Refuses(..) => {
                 // What is busy is asked again soon, before all others.
                 let is_busy = matches!(trouble, Trouble::Refuses(_, 5 | 6));
                 let of_others = if is_busy { AHEAD * unit.cost() } else { 0.0 };
-                self.look_for_starving(&times, span, Some(number), |of| of.cost() + of_others)
+                self.look_for_starving(times, span, Some(number_of(befallen)), |of| of.cost() + of_others)
             }
-            Trouble::Collisions(_) => self.look_for_starving(&times, span, None, |of| of.cost() + COLLISION),
+            Trouble::Collisions(_) => self.look_for_starving(times, span, None, |of| of.cost() + COLLISION),
             // Others have to wait for its silence, and it is asked as seldom as it pleases.
             Trouble::Dead(_) | Trouble::Breaks(_) => Ok(()),
         }
+    }
+
+    /// The place of the unit which that befalls; where it befalls all of them, any.
+    fn befallen_by(&self, trouble: Trouble) -> usize {
+        trouble.unit().unwrap_or_default() % self.units.len()
     }
 
     /// Each read has its turn within a few times what would be its share of the wire, but for those of a unit that is
@@ -457,7 +480,8 @@ fn nobody_starves_where_somebody_did() {
             Trouble::Nothing,
         ),
         (
-            "a device that rests on a bus that is never done: its fast reads had put off its slow ones by more than those              had waited",
+            "a device that rests on a bus that is never done: its fast reads had put off its slow ones by more than \
+             those had waited",
             false,
             vec![
                 unit([34, 408, 60, 84], [4, 3]),
