@@ -14,6 +14,16 @@ use std::process::Command;
 
 use serde_json::Value as Json;
 
+#[path = "../support/number.rs"]
+mod number;
+
+use number::number;
+
+/// So far from the one to the other, where each decade is as long as the next: half way from 1 to 100 lies 10.
+fn by_magnitude(part: f64, from: f64, to: f64) -> u64 {
+    (from * libm::pow(to / from, part)) as u64
+}
+
 /// What `busker check --json` says of this configuration.
 fn check(configuration: &str, arguments: &[&str]) -> Json {
     let folder = tempfile::tempdir().expect("a temporary folder");
