@@ -1,7 +1,7 @@
 //! A bus, its guard and a line of simulated devices, joined without threads, ports and clocks: an hour
 //! passes as fast as it can be calculated.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use busker::engine::bus::{Action, Bus, Event};
 use busker::engine::health::BusReport;
@@ -40,6 +40,8 @@ pub struct World {
     frames: Vec<(Time, u8, String)>,
     /// So often two spoke at the same time.
     pub collisions: u32,
+    /// What befell a device, of whichever kind.
+    pub faults: BTreeSet<String>,
     /// What spoils characters again and again, for ever.
     pub disturbance: Option<Disturbance>,
     /// So many requests have been sent since there was one.
@@ -113,6 +115,7 @@ impl World {
             published: Vec::new(),
             frames: Vec::new(),
             collisions: 0,
+            faults: BTreeSet::new(),
             disturbance: None,
             disturbed_requests: 0,
             memories: Memories::default(),
@@ -162,6 +165,7 @@ impl World {
 
     /// From now on the device does something that it should not.
     pub fn fault(&mut self, unit: u8, fault: &str) {
+        self.faults.insert(fault.into());
         let fault = format!("unit={unit},{fault}").parse().expect("a fault");
         self.act(unit, &script::Action::Fault(fault));
     }
