@@ -36,12 +36,7 @@ fn what_is_refused_for_a_moment_is_read_in_one_request_again() {
         }
         world.fault(UNIT, "exception=2");
         world.run_until(world.now + Duration::from_secs(5));
-        world.act(UNIT, &Action::Repair { unit: UNIT });
-        world.run_until(world.now + Duration::from_secs(70));
-        assert_eq!(requests(&mut world, 10), 10 * EACH_SECOND, "restarts: {restarts}");
-        // And nothing of it is remembered.
-        let memory = world.memories.devices.get(&device_name(UNIT));
-        assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{memory:?}");
+        check_that_it_is_over(&mut world, &format!("restarts: {restarts}"));
     }
 }
 
@@ -55,12 +50,18 @@ fn a_device_that_was_busy_for_long_and_then_refuses_something_once_has_not_refus
         world.act(UNIT, &Action::Repair { unit: UNIT });
         world.fault(UNIT, "exception=2");
         world.run_until(world.now + Duration::from_secs(3));
-        world.act(UNIT, &Action::Repair { unit: UNIT });
-        world.run_until(world.now + Duration::from_secs(70));
-        assert_eq!(requests(&mut world, 10), 10 * EACH_SECOND, "{before}");
-        let memory = world.memories.devices.get(&device_name(UNIT));
-        assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{before}: {memory:?}");
+        check_that_it_is_over(&mut world, before);
     }
+}
+
+/// Once the unit is well again all is soon read as before, and nothing of it is remembered.
+#[track_caller]
+fn check_that_it_is_over(world: &mut World, what: &str) {
+    world.act(UNIT, &Action::Repair { unit: UNIT });
+    world.run_until(world.now + Duration::from_secs(70));
+    assert_eq!(requests(world, 10), 10 * EACH_SECOND, "{what}");
+    let memory = world.memories.devices.get(&device_name(UNIT));
+    assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{what}: {memory:?}");
 }
 
 #[test]
