@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde_json::Value;
 
-use crate::peer::{Framing, Misbehave, Peer, Step, exception, read_pdu, rtu};
+use crate::peer::{Framing, Misbehave, Peer, Step, exception, garbled, read_pdu, rtu};
 use crate::stage::{LIE, Stage};
 use crate::support::wait_for;
 
@@ -77,10 +77,7 @@ fn eventful(peer: &Peer) -> Stage<'_> {
     let faults: &[((u8, u16), Misbehave)] = &[
         (a, |_, _| Vec::new()),
         (a, |asked, _| vec![Step::SayBeforeNext(rtu(asked.unit, &read_pdu(4, &[LIE])))]),
-        (a, |_, mut good| {
-            good[3] ^= 0x10;
-            vec![Step::Say(good)]
-        }),
+        (a, |_, good| vec![Step::Say(garbled(good))]),
         (a, |_, good| vec![Step::Say([vec![0xFF, 0, 0], good].concat())]),
         (a, |asked, _| vec![Step::Say(rtu(asked.unit + 8, &read_pdu(4, &[LIE])))]),
         (b, |asked, _| vec![Step::Say(exception(asked, Framing::Rtu, 4))]),

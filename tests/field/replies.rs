@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::Row;
-use crate::peer::{Asked, Framing, Misbehave, Peer, Step, exception, read_pdu, reply, rtu};
+use crate::peer::{Asked, Framing, Misbehave, Peer, Step, exception, garbled, read_pdu, reply, rtu};
 use crate::stage::{LIE, Shown, Stage};
 use crate::support::wait_for;
 
@@ -307,12 +307,9 @@ fn busy() {
 
 fn three_faults() {
     let peer = Peer::on_a_pseudo_terminal();
-    peer.misbehave(|asked, mut good| match asked.unit {
+    peer.misbehave(|asked, good| match asked.unit {
         1 => Vec::new(),
-        2 => {
-            good[3] ^= 0x10;
-            vec![Step::Say(good)]
-        }
+        2 => vec![Step::Say(garbled(good))],
         3 => vec![Step::Say(rtu(9, &read_pdu(4, &[LIE])))],
         _ => vec![Step::Say(good)],
     });

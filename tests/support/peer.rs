@@ -462,6 +462,13 @@ pub fn reply(asked: &Asked, framing: Framing, pdu: &[u8]) -> Vec<u8> {
     }
 }
 
+/// The frame with a bit of it turned over.
+pub fn garbled(mut frame: Vec<u8>) -> Vec<u8> {
+    let middle = frame.len() / 2;
+    frame[middle] ^= 0x10;
+    frame
+}
+
 /// An RTU frame.
 pub fn rtu(unit: u8, pdu: &[u8]) -> Vec<u8> {
     let mut frame = [&[unit], pdu].concat();
