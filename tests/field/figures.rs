@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde_json::Value;
 
-use crate::peer::{Framing, Misbehave, Peer, Step, exception, garbled, read_pdu, rtu};
-use crate::stage::{LIE, Stage};
+use crate::peer::{Framing, LIE, Misbehave, Peer, Step, exception, garbled, read_pdu, rtu};
+use crate::stage::Stage;
 use crate::support::wait_for;
 
 /// A figure by the three names that it has: its place in JSON, in `/metrics` and as an entity.

@@ -17,6 +17,20 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
 
+/// What no device ever holds.
+pub const LIE: u16 = 9999;
+
+/// The configuration of one unit of which each reply could be that to each request.
+pub const ALIKE: &str = "  one:
+    bus: line
+    unit: 1
+    poll: {fast: 100ms}
+    wire: {limits: {gap: 0}}
+    points:
+      a: {at: input 0, poll: fast}
+      b: {at: input 100, poll: fast}
+";
+
 /// A request as it came.
 #[derive(Clone, Debug)]
 pub struct Asked {
@@ -443,6 +457,11 @@ pub fn read_pdu(function: u8, words: &[u16]) -> Vec<u8> {
         _ => words.iter().flat_map(|word| word.to_be_bytes()).collect(),
     };
     [&[function, bytes.len() as u8], &bytes[..]].concat()
+}
+
+/// An answer to a read of one input register that is none of the device's.
+pub fn lie(asked: &Asked) -> Vec<u8> {
+    rtu(asked.unit, &read_pdu(4, &[LIE]))
 }
 
 /// A refusal.
