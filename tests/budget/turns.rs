@@ -15,6 +15,153 @@ use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
 use super::plain::Plain;
 use super::{by_magnitude, number};
 
+#[test]
+fn nobody_starves_and_all_have_equal_shares_after_whatever_befell_the_bus() {
+    let cases = number("CASES").unwrap_or(CASES);
+    let config = Config { cases, failure_persistence: None, ..Config::default() };
+    let mut seed = [0; 32];
+    seed[..4].copy_from_slice(&number::<u32>("SEED").unwrap_or(1).to_le_bytes());
+    let random = TestRng::from_seed(RngAlgorithm::ChaCha, &seed);
+    let all = Cell::new(Compared::default());
+    let outcome = TestRunner::new_with_rng(config, random).run(&case(), |case| {
+        all.set(all.get().and(live(&case)?));
+        Ok(())
+    });
+    outcome.unwrap_or_else(|fault| panic!("{fault}"));
+    println!("{:?}", all.get());
+    assert!(cases < CASES || all.get().shows_something(), "{:?}", all.get());
+}
+
+const CASES: u32 = 24;
+
+/// What random cases have found.
+#[test]
+fn nobody_starves_where_somebody_did() {
+    let unit = |[fast, slow, cost, rest]: [u64; 4], [fast_reads, slow_reads]: [u16; 2]| Unit {
+        fast,
+        slow,
+        cost,
+        rest,
+        fast_reads,
+        slow_reads,
+        once_reads: 0,
+    };
+    let commanded = || unit([1_000, 10_000, 20, 0], [1, 0]);
+    let resting = |rest| unit([100, 1_000, 5, rest], [3, 1]);
+    let mut all = Compared::default();
+    for (what, closes, units, trouble) in [
+        (
+            "commands: turns that went before their time did not count, and fast reads had them all",
+            false,
+            vec![commanded(), unit([100, 2_000, 20, 0], [1, 2])],
+            Trouble::Commands(0),
+        ),
+        (
+            "commands without a moment between them: the time that they took did not count, and who was ahead stayed so",
+            false,
+            vec![unit([20, 120, 38, 0], [0, 0]), unit([20, 40, 1, 0], [1, 1])],
+            Trouble::SomeCommands(0, 5),
+        ),
+        (
+            "commands for a device that rests behind each: they waited for that on the wire, and reads did not",
+            false,
+            vec![resting(20)],
+            Trouble::Commands(0),
+        ),
+        (
+            "wishes for a point of a device that rests: meanwhile nothing was due, and they were counted anew",
+            false,
+            vec![resting(100)],
+            Trouble::Gets(0, 20),
+        ),
+        (
+            "a server that closes each connection: the bus was taken to be done with everything at each new one",
+            true,
+            vec![unit([11, 66, 8, 0], [2, 3]), unit([7, 77, 1, 0], [4, 0])],
+            Trouble::Nothing,
+        ),
+        (
+            "a device that rests on a bus that is never done: its fast reads had put off its slow ones by more than \
+             those had waited",
+            false,
+            vec![
+                unit([34, 408, 60, 84], [4, 3]),
+                unit([42, 42, 14, 0], [2, 0]),
+                unit([128, 1_024, 1, 0], [3, 0]),
+            ],
+            Trouble::Nothing,
+        ),
+        (
+            "a device that is asked much more seldom than it wants: one of its reads made up for all that it had waited",
+            false,
+            vec![unit([1, 1, 1, 5], [3, 3]), unit([46, 138, 3, 0], [2, 3])],
+            Trouble::Slow(1),
+        ),
+    ] {
+        let case = Case { is_network: true, closes, units, troubles: vec![(trouble, 40_000)] };
+        let compared = live(&case).unwrap_or_else(|fault| panic!("{what}: {fault}"));
+        all = all.and(compared);
+    }
+    assert!(all.shows_something(), "{all:?}");
+}
+
+/// What is asked again at once is one turn, and its period is not over the sooner.
+#[test]
+fn a_read_that_collides_each_time_comes_no_more_often() {
+    let unit =
+        Unit { fast: 1_000, slow: 1_000, cost: 100, rest: 0, fast_reads: 1, slow_reads: 0, once_reads: 0 };
+    let case = Case { is_network: false, closes: false, units: vec![unit], troubles: Vec::new() };
+    let mut line = Plain::new(&case.configuration(), vec![100]);
+    line.collides_each = Some(2);
+    line.run_for(SETTLES).expect("no fault");
+    line.asked.clear();
+    line.run_for(60_000).expect("no fault");
+    assert!((59..=61).contains(&line.asked.len()), "{}", line.asked.len());
+}
+
+/// So many times what it would be if everybody had their share at each moment a read may wait: others may be two periods
+/// behind when it has just had its turn, and those and its own it then waits for.
+const UNEVENLY: f64 = 4.0;
+/// And so long in any case, behind a silence and what is asked again behind that.
+const SILENCE: f64 = 2.0;
+const WITHIN: f64 = 0.1;
+/// What has come round more seldom has no mean to speak of.
+const ROUNDS: usize = 30;
+
+/// The life of a bus: what befalls it, and how it is behind that.
+fn live(case: &Case) -> Result<Compared, TestCaseError> {
+    let mut line = Plain::new(&case.configuration(), case.units.iter().map(|unit| unit.cost).collect());
+    let fail = |text: String| TestCaseError::fail(format!("{text}\n{}", case.configuration()));
+    line.closes = case.closes;
+    line.run_for(SETTLES).map_err(fail)?;
+    for (trouble, lasts) in &case.troubles {
+        line.asked.clear();
+        let from = line.now;
+        let outcome = case.perform(&mut line, *trouble, *lasts);
+        let span = [from, line.now];
+        let outcome = outcome.and_then(|()| case.judge(*trouble, &times(&mut line), span));
+        outcome.map_err(|text| fail(format!("{trouble:?}: {text}")))?;
+        // A device that is away, or refuses something, is asked again only so often.
+        if matches!(trouble, Trouble::Dead(_) | Trouble::Refuses(..) | Trouble::Breaks(_)) {
+            line.run_for(FORGOTTEN).map_err(fail)?;
+        }
+    }
+    line.run_for(SETTLES).map_err(fail)?;
+    line.asked.clear();
+    let from = line.now;
+    // For as long as the slowest needs, within reason.
+    let longest = case.periods().values().copied().fold(1.0, f64::max) * case.load(Unit::cost).max(1.0);
+    let until = from + Duration::from_secs_f64(longest * (ROUNDS + 2) as f64);
+    while line.now < until && line.asked.len() < REQUESTS {
+        line.run_for(1_000).map_err(fail)?;
+    }
+    let times = times(&mut line);
+    case.look_for_starving(&times, [from, line.now], None, Unit::cost).map_err(fail)?;
+    case.look_for_unfairness(&times).map_err(fail)
+}
+
+const REQUESTS: usize = 4_000;
+
 #[derive(Clone, Debug)]
 struct Unit {
     /// All of these in milliseconds: the poll periods, how long a request takes, and the silence that it wants.
@@ -221,48 +368,6 @@ fn times(line: &mut Plain) -> Times {
     times
 }
 
-/// So many times what it would be if everybody had their share at each moment a read may wait: others may be two periods
-/// behind when it has just had its turn, and those and its own it then waits for.
-const UNEVENLY: f64 = 4.0;
-/// And so long in any case, behind a silence and what is asked again behind that.
-const SILENCE: f64 = 2.0;
-const WITHIN: f64 = 0.1;
-/// What has come round more seldom has no mean to speak of.
-const ROUNDS: usize = 30;
-
-fn live(case: &Case) -> Result<Compared, TestCaseError> {
-    let mut line = Plain::new(&case.configuration(), case.units.iter().map(|unit| unit.cost).collect());
-    let fail = |text: String| TestCaseError::fail(format!("{text}\n{}", case.configuration()));
-    line.closes = case.closes;
-    line.run_for(SETTLES).map_err(fail)?;
-    for (trouble, lasts) in &case.troubles {
-        line.asked.clear();
-        let from = line.now;
-        let outcome = case.perform(&mut line, *trouble, *lasts);
-        let span = [from, line.now];
-        let outcome = outcome.and_then(|()| case.judge(*trouble, &times(&mut line), span));
-        outcome.map_err(|text| fail(format!("{trouble:?}: {text}")))?;
-        // A device that is away, or refuses something, is asked again only so often.
-        if matches!(trouble, Trouble::Dead(_) | Trouble::Refuses(..) | Trouble::Breaks(_)) {
-            line.run_for(FORGOTTEN).map_err(fail)?;
-        }
-    }
-    line.run_for(SETTLES).map_err(fail)?;
-    line.asked.clear();
-    let from = line.now;
-    // For as long as the slowest needs, within reason.
-    let longest = case.periods().values().copied().fold(1.0, f64::max) * case.load(Unit::cost).max(1.0);
-    let until = from + Duration::from_secs_f64(longest * (ROUNDS + 2) as f64);
-    while line.now < until && line.asked.len() < REQUESTS {
-        line.run_for(1_000).map_err(fail)?;
-    }
-    let times = times(&mut line);
-    case.look_for_starving(&times, [from, line.now], None, Unit::cost).map_err(fail)?;
-    case.look_for_unfairness(&times).map_err(fail)
-}
-
-const REQUESTS: usize = 4_000;
-
 impl Case {
     /// Lets it befall the bus for so many milliseconds.
     fn perform(&self, line: &mut Plain, trouble: Trouble, lasts: u64) -> Result<(), String> {
@@ -446,107 +551,3 @@ const COLLISION: f64 = 0.6;
 /// A bus keeps up at less, and does not at more.
 const KEEPS_UP: f64 = 0.7;
 const OVERLOADED: f64 = 1.1;
-
-#[test]
-fn nobody_starves_and_all_have_equal_shares_after_whatever_befell_the_bus() {
-    let cases = number("CASES").unwrap_or(CASES);
-    let config = Config { cases, failure_persistence: None, ..Config::default() };
-    let mut seed = [0; 32];
-    seed[..4].copy_from_slice(&number::<u32>("SEED").unwrap_or(1).to_le_bytes());
-    let random = TestRng::from_seed(RngAlgorithm::ChaCha, &seed);
-    let all = Cell::new(Compared::default());
-    let outcome = TestRunner::new_with_rng(config, random).run(&case(), |case| {
-        all.set(all.get().and(live(&case)?));
-        Ok(())
-    });
-    outcome.unwrap_or_else(|fault| panic!("{fault}"));
-    println!("{:?}", all.get());
-    assert!(cases < CASES || all.get().shows_something(), "{:?}", all.get());
-}
-
-const CASES: u32 = 24;
-
-/// What random cases have found.
-#[test]
-fn nobody_starves_where_somebody_did() {
-    let unit = |[fast, slow, cost, rest]: [u64; 4], [fast_reads, slow_reads]: [u16; 2]| Unit {
-        fast,
-        slow,
-        cost,
-        rest,
-        fast_reads,
-        slow_reads,
-        once_reads: 0,
-    };
-    let commanded = || unit([1_000, 10_000, 20, 0], [1, 0]);
-    let resting = |rest| unit([100, 1_000, 5, rest], [3, 1]);
-    let mut all = Compared::default();
-    for (what, closes, units, trouble) in [
-        (
-            "commands: turns that went before their time did not count, and fast reads had them all",
-            false,
-            vec![commanded(), unit([100, 2_000, 20, 0], [1, 2])],
-            Trouble::Commands(0),
-        ),
-        (
-            "commands without a moment between them: the time that they took did not count, and who was ahead stayed so",
-            false,
-            vec![unit([20, 120, 38, 0], [0, 0]), unit([20, 40, 1, 0], [1, 1])],
-            Trouble::SomeCommands(0, 5),
-        ),
-        (
-            "commands for a device that rests behind each: they waited for that on the wire, and reads did not",
-            false,
-            vec![resting(20)],
-            Trouble::Commands(0),
-        ),
-        (
-            "wishes for a point of a device that rests: meanwhile nothing was due, and they were counted anew",
-            false,
-            vec![resting(100)],
-            Trouble::Gets(0, 20),
-        ),
-        (
-            "a server that closes each connection: the bus was taken to be done with everything at each new one",
-            true,
-            vec![unit([11, 66, 8, 0], [2, 3]), unit([7, 77, 1, 0], [4, 0])],
-            Trouble::Nothing,
-        ),
-        (
-            "a device that rests on a bus that is never done: its fast reads had put off its slow ones by more than \
-             those had waited",
-            false,
-            vec![
-                unit([34, 408, 60, 84], [4, 3]),
-                unit([42, 42, 14, 0], [2, 0]),
-                unit([128, 1_024, 1, 0], [3, 0]),
-            ],
-            Trouble::Nothing,
-        ),
-        (
-            "a device that is asked much more seldom than it wants: one of its reads made up for all that it had waited",
-            false,
-            vec![unit([1, 1, 1, 5], [3, 3]), unit([46, 138, 3, 0], [2, 3])],
-            Trouble::Slow(1),
-        ),
-    ] {
-        let case = Case { is_network: true, closes, units, troubles: vec![(trouble, 40_000)] };
-        let compared = live(&case).unwrap_or_else(|fault| panic!("{what}: {fault}"));
-        all = all.and(compared);
-    }
-    assert!(all.shows_something(), "{all:?}");
-}
-
-/// What is asked again at once is one turn, and its period is not over the sooner.
-#[test]
-fn a_read_that_collides_each_time_comes_no_more_often() {
-    let unit =
-        Unit { fast: 1_000, slow: 1_000, cost: 100, rest: 0, fast_reads: 1, slow_reads: 0, once_reads: 0 };
-    let case = Case { is_network: false, closes: false, units: vec![unit], troubles: Vec::new() };
-    let mut line = Plain::new(&case.configuration(), vec![100]);
-    line.collides_each = Some(2);
-    line.run_for(SETTLES).expect("no fault");
-    line.asked.clear();
-    line.run_for(60_000).expect("no fault");
-    assert!((59..=61).contains(&line.asked.len()), "{}", line.asked.len());
-}
