@@ -23,10 +23,9 @@ use busker::engine::configuration;
 use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
-use busker::simulator::device::Place;
-use busker::simulator::line::Line;
+use busker::simulator::Fault;
+use busker::simulator::device::SimulatedDevice;
 use busker::simulator::script::Action;
-use busker::simulator::{Fault, LineSettings};
 use fastrand::Rng;
 
 use device::{BLOCK, BLOCKS, Diary, STORED, Store, Timepiece, held};
@@ -142,17 +141,12 @@ struct Sent {
 impl Soak {
     fn new(seed: u64, link: Link, always: Option<&str>) -> Soak {
         let diary = Diary::default();
-        let turnaround = Duration::from_millis(5);
-        let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
-        for unit in UNITS {
-            let at = Place { unit, device: device_name(unit) };
-            line.add(at, Box::new(Timepiece::new(unit, diary.clone()))).expect("a unit of its own");
-        }
+        let timepiece = |unit| Box::new(Timepiece::new(unit, diary.clone())) as Box<dyn SimulatedDevice>;
+        let mut world = World::with_devices(gateway(link), timepiece);
         let always = always.map(|fault| fault.parse::<Fault>().expect("a fault"));
         if let Some(fault) = &always {
-            line.add_fault(Time(0), fault).expect("all units");
+            world.line.add_fault(Time(0), fault).expect("all units");
         }
-        let world = World::new(gateway(link), line);
         Soak { random: Rng::with_seed(seed), link, always, world, diary, commands: Vec::new() }
     }
 

@@ -7,10 +7,9 @@ use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Command, Event};
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
-use busker::simulator::device::{Place, SimulatedDevice};
-use busker::simulator::line::Line;
+use busker::simulator::Stimulus;
+use busker::simulator::device::SimulatedDevice;
 use busker::simulator::script::Action;
-use busker::simulator::{LineSettings, Stimulus};
 
 use crate::device::{BLOCK, BLOCKS, Diary, STORED, Timepiece};
 use crate::watched::{Holes, Ledger, Watched};
@@ -204,13 +203,11 @@ fn world(link: &str, fast: &str) -> World {
 }
 
 fn world_with(settings: Settings, of_unit: Box<dyn SimulatedDevice>) -> World {
-    let turnaround = Duration::from_millis(5);
-    let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
-    let of_other: Box<dyn SimulatedDevice> = Box::new(Timepiece::new(OTHER, Diary::default()));
-    for (unit, device) in [(UNIT, of_unit), (OTHER, of_other)] {
-        line.add(Place { unit, device: device_name(unit) }, device).expect("a unit of its own");
-    }
-    World::new(settings, line)
+    let mut of_unit = Some(of_unit);
+    World::with_devices(settings, |unit| match unit {
+        UNIT => of_unit.take().expect("there is one"),
+        other => Box::new(Timepiece::new(other, Diary::default())),
+    })
 }
 
 fn gateway(link: &str, fast: &str) -> Settings {

@@ -11,10 +11,10 @@ use busker::engine::modbus::{Reply, RequestError};
 use busker::engine::settings::{Link, Settings};
 use busker::engine::time::{Duration, Time};
 use busker::engine::topics::Message;
-use busker::simulator::Framing;
+use busker::simulator::device::{Place, SimulatedDevice};
 use busker::simulator::line::{Line, Transmission};
-use busker::simulator::script;
 use busker::simulator::wire::{Receiver, character_time};
+use busker::simulator::{Framing, LineSettings, script};
 
 pub struct World {
     pub now: Time,
@@ -92,6 +92,20 @@ enum Port {
 }
 
 impl World {
+    /// A usual line, with the device that `simulated` makes for each unit.
+    pub fn with_devices(
+        settings: Settings,
+        mut simulated: impl FnMut(u8) -> Box<dyn SimulatedDevice>,
+    ) -> World {
+        let turnaround = Duration::from_millis(5);
+        let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
+        for device in &settings.devices {
+            let at = Place { unit: device.unit, device: device.name.clone() };
+            line.add(at, simulated(device.unit)).expect("a unit of its own");
+        }
+        World::new(settings, line)
+    }
+
     pub fn new(settings: Settings, line: Line) -> World {
         let now = Time(0);
         let framing = match &settings.buses[0].link {
