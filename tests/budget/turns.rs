@@ -75,6 +75,18 @@ fn nobody_starves_where_somebody_did() {
             Trouble::Gets(0, 20),
         ),
         (
+            "wishes for a point of a device that rests: meanwhile another had its turns, and they were counted anew",
+            false,
+            vec![unit([20, 20, 1, 0], [1, 0]), unit([20, 20, 1, 11], [1, 1])],
+            Trouble::Gets(1, 5),
+        ),
+        (
+            "the same where the other takes longer than the device rests",
+            false,
+            vec![unit([20, 20, 30, 0], [1, 0]), unit([20, 20, 1, 11], [1, 1])],
+            Trouble::Gets(1, 5),
+        ),
+        (
             "a server that closes each connection: the bus was taken to be done with everything at each new one",
             true,
             vec![unit([11, 66, 8, 0], [2, 3]), unit([7, 77, 1, 0], [4, 0])],
