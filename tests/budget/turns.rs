@@ -131,6 +131,18 @@ fn a_read_that_collides_each_time_comes_no_more_often() {
     assert!((59..=61).contains(&line.asked.len()), "{}", line.asked.len());
 }
 
+/// Its reads are wanted again at once and wait for its silence: that is no reason to go before anything while it lasts.
+#[test]
+fn a_device_that_rests_and_is_busy_is_asked_when_the_bus_wakes_and_not_before() {
+    let units = [[228, 1, 0, 1, 0], [168, 29, 17, 3, 3]].map(|[fast, cost, rest, fast_reads, slow_reads]| {
+        let [fast_reads, slow_reads] = [fast_reads, slow_reads].map(|count: u64| count as u16);
+        Unit { fast, slow: fast * 12, cost, rest, fast_reads, slow_reads, once_reads: 0 }
+    });
+    let troubles = vec![(Trouble::Refuses(1, 5), 10_497)];
+    let case = Case { is_network: false, closes: false, units: units.to_vec(), troubles };
+    live(&case).unwrap_or_else(|fault| panic!("{fault}"));
+}
+
 /// So many times what it would be if everybody had their share at each moment a read may wait: others may be two periods
 /// behind when it has just had its turn, and those and its own it then waits for.
 const UNEVENLY: f64 = 4.0;
