@@ -1,9 +1,11 @@
-//! What a bus does with its wire, on simulated time: as `busker check` forecasts it, and with plans that
-//! follow the devices.
+//! What a bus does with its wire, on simulated time: as `busker check` forecasts it for lines, networks and watchdogs,
+//! also of random configurations; with plans that follow the devices; and with fair turns for all, whatever befalls it.
 
 mod feeding;
 mod forecast;
 mod network;
+#[path = "../support/number.rs"]
+mod number;
 mod plain;
 mod plans;
 mod random;
@@ -12,7 +14,24 @@ mod wire;
 
 use std::process::Command;
 
+use busker::engine::configuration;
+use busker::engine::profile::Library;
+use busker::engine::settings::Settings;
 use serde_json::Value as Json;
+
+use number::number;
+
+/// What a configuration without faults says.
+#[track_caller]
+fn settings(configuration: &str) -> Settings {
+    let loaded = configuration::load("f", configuration.as_bytes(), &Library::shipped());
+    loaded.unwrap_or_else(|faults| panic!("{faults:?}")).0
+}
+
+/// So far from the one to the other, where each decade is as long as the next: half way from 1 to 100 lies 10.
+fn by_magnitude(part: f64, from: f64, to: f64) -> u64 {
+    (from * libm::pow(to / from, part)) as u64
+}
 
 /// What `busker check --json` says of this configuration.
 fn check(configuration: &str, arguments: &[&str]) -> Json {

@@ -4,13 +4,11 @@
 use std::collections::BTreeMap;
 
 use busker::engine::bus::{Action, Bus, Command, Event};
-use busker::engine::configuration;
 use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Reply};
-use busker::engine::profile::Library;
 use busker::engine::time::{Duration, Time};
 
-use super::check;
+use super::{check, settings};
 
 const WITHIN: f64 = 0.05;
 
@@ -60,9 +58,7 @@ impl Case {
     }
 
     fn live(&self) -> Found {
-        let text = self.configuration();
-        let (settings, _) = configuration::load("f", text.as_bytes(), &Library::shipped())
-            .unwrap_or_else(|faults| panic!("{faults:?}"));
+        let settings = settings(&self.configuration());
         let mut bus = Bus::new(Time(0), &settings, 0, &Memories::default());
         let (mut now, end) = (Time(0), Time::from_millis(150_000));
         let (settled, crowded) = (Time::from_millis(60_000), Time::from_millis(120_000));

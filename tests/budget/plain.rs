@@ -1,16 +1,17 @@
-//! A bus and units that hold zeros, on simulated time: a request takes as long as its unit takes, and nothing else.
+//! A bus and units that hold what was last written to any of them, on simulated time: a request takes as long as its unit
+//! takes, and nothing else.
 //!
 //! It looks at what the bus sleeps for: a wake that comes too soon must find nothing to do, and behind one that was in vain
 //! the bus must not want another at the same moment.
 
 use busker::engine::bus::{Action, Bus, Command, Event};
-use busker::engine::configuration;
 use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
-use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
 use fastrand::Rng;
+
+use super::settings;
 
 /// What was on the wire.
 #[derive(Clone, Copy, Debug)]
@@ -54,8 +55,7 @@ struct Sending {
 
 impl Plain {
     pub fn new(configuration: &str, costs: Vec<u64>) -> Plain {
-        let (settings, _) = configuration::load("f", configuration.as_bytes(), &Library::shipped())
-            .unwrap_or_else(|faults| panic!("{faults:?}"));
+        let settings = settings(configuration);
         let mut plain = Plain {
             now: Time(0),
             asked: Vec::new(),

@@ -4,15 +4,15 @@
 use std::collections::BTreeMap;
 
 use busker::engine::bus::{Action, Bus, Command, Event};
-use busker::engine::configuration;
 use busker::engine::device::Identify;
 use busker::engine::memory::Memories;
 use busker::engine::modbus::Reply;
 use busker::engine::modbus::crc::crc;
 use busker::engine::modbus::guard::Guard;
-use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
+
+use super::settings;
 
 /// What was on the wire.
 #[derive(Clone, Copy, Debug)]
@@ -52,8 +52,7 @@ pub struct Wire {
 
 impl Wire {
     pub fn new(configuration: &str, turnaround: Duration) -> Wire {
-        let (settings, _) = configuration::load("f", configuration.as_bytes(), &Library::shipped())
-            .unwrap_or_else(|faults| panic!("{faults:?}"));
+        let settings = settings(configuration);
         let mut wire = Wire {
             now: Time(0),
             bus: Bus::new(Time(0), &settings, 0, &Memories::default()),

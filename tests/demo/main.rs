@@ -80,7 +80,8 @@ fn make_demo_shows_live_values_and_its_three_commands_do_what_they_say() {
 
 #[test]
 fn on_a_terminal_it_is_a_table_that_is_redrawn_in_place() {
-    let controller = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
+    let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+    let controller = openpt(flags).expect("a pseudo-terminal");
     grantpt(&controller).and_then(|()| unlockpt(&controller)).expect("it can be used");
     let path = ptsname(&controller, Vec::new()).expect("its name").into_string().expect("in UTF-8");
     let terminal = File::options().read(true).write(true).open(path).expect("it opens");

@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde_json::Value;
 
-use crate::peer::{Framing, Misbehave, Peer, Step, exception, read_pdu, rtu};
-use crate::stage::{LIE, Stage};
+use crate::peer::{Framing, LIE, Misbehave, Peer, Step, exception, garbled, read_pdu, rtu};
+use crate::stage::Stage;
 use crate::support::wait_for;
 
 /// A figure by the three names that it has: its place in JSON, in `/metrics` and as an entity.
@@ -77,10 +77,7 @@ fn eventful(peer: &Peer) -> Stage<'_> {
     let faults: &[((u8, u16), Misbehave)] = &[
         (a, |_, _| Vec::new()),
         (a, |asked, _| vec![Step::SayBeforeNext(rtu(asked.unit, &read_pdu(4, &[LIE])))]),
-        (a, |_, mut good| {
-            good[3] ^= 0x10;
-            vec![Step::Say(good)]
-        }),
+        (a, |_, good| vec![Step::Say(garbled(good))]),
         (a, |_, good| vec![Step::Say([vec![0xFF, 0, 0], good].concat())]),
         (a, |asked, _| vec![Step::Say(rtu(asked.unit + 8, &read_pdu(4, &[LIE])))]),
         (b, |asked, _| vec![Step::Say(exception(asked, Framing::Rtu, 4))]),

@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use busker::engine::time::Duration;
 
 use crate::Row;
-use crate::peer::{Framing, Peer, Placeholder, Step, read_pdu, rtu};
-use crate::stage::{LIE, Shown, Stage};
+use crate::peer::{Framing, LIE, Peer, Placeholder, Step, read_pdu, rtu};
+use crate::stage::{Shown, Stage};
 use crate::support::wait_for;
 
 pub const ROWS: &[Row] = &[

@@ -4,8 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::Row;
-use crate::peer::{Asked, Framing, Misbehave, Peer, Step, exception, read_pdu, reply, rtu};
-use crate::stage::{LIE, Shown, Stage};
+use crate::peer::{
+    ALIKE, Asked, Framing, LIE, Misbehave, Peer, Step, exception, garbled, lie, read_pdu, reply, rtu,
+};
+use crate::stage::{Shown, Stage};
 use crate::support::wait_for;
 
 pub const ROWS: &[Row] = &[
@@ -88,16 +90,6 @@ pub const ROWS: &[Row] = &[
     },
 ];
 
-/// One unit, of which each reply could be that to each request.
-const ALIKE: &str = "  one:
-    bus: line
-    unit: 1
-    poll: {fast: 100ms}
-    wire: {limits: {gap: 0}}
-    points:
-      a: {at: input 0, poll: fast}
-      b: {at: input 100, poll: fast}
-";
 const ALIKE_SHOWN: [Shown; 2] = [("one/a", (1, 4, 0)), ("one/b", (1, 4, 100))];
 
 /// A unit with a register for each of these names.
@@ -106,10 +98,6 @@ fn unit(name: &str, number: u8, wire: &str) -> String {
         "  {name}: {{bus: line, unit: {number}, poll: {{fast: 100ms}}, wire: {{{wire}}}, \
          points: {{a: {{at: input 0, poll: fast}}}}}}\n"
     )
-}
-
-fn lie(asked: &Asked) -> Vec<u8> {
-    rtu(asked.unit, &read_pdu(4, &[LIE]))
 }
 
 fn place(asked: &Asked) -> (u8, u8, u16) {
@@ -307,12 +295,9 @@ fn busy() {
 
 fn three_faults() {
     let peer = Peer::on_a_pseudo_terminal();
-    peer.misbehave(|asked, mut good| match asked.unit {
+    peer.misbehave(|asked, good| match asked.unit {
         1 => Vec::new(),
-        2 => {
-            good[3] ^= 0x10;
-            vec![Step::Say(good)]
-        }
+        2 => vec![Step::Say(garbled(good))],
         3 => vec![Step::Say(rtu(9, &read_pdu(4, &[LIE])))],
         _ => vec![Step::Say(good)],
     });

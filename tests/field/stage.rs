@@ -9,9 +9,6 @@ use serde_json::Value;
 use crate::peer::{Peer, Place};
 use crate::support::{Broker, Gateway, Watcher, find, wait_for};
 
-/// What no device ever holds.
-pub const LIE: u16 = 9999;
-
 /// `busker/one/a`, and the register that it shows.
 pub type Shown = (&'static str, Place);
 

@@ -1,12 +1,11 @@
 //! One device by hand: `busker read`, `write` and `diagnose` as somebody types them.
 
-use std::fs;
 use std::process::{Command, Output};
 
 use serde_json::Value;
 
 use crate::peer::{Framing, Misbehave, Peer, Step, rtu};
-use crate::support::program;
+use crate::support::{program, temporary_file, temporary_folder};
 use crate::{MIXED, in_single_bytes};
 
 #[test]
@@ -54,10 +53,9 @@ fn an_echo_is_no_confirmation_also_by_hand() {
 fn with_a_configuration_points_are_read_and_written_by_their_rules() {
     let peer = Peer::on_a_pseudo_terminal();
     peer.hold(1, 4, 0, 123);
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let path = folder.path().join("busker.yaml");
-    fs::write(&path, format!("buses:\n  line: {{{}}}\ndevices:\n{MIXED}", peer.link())).expect("a file");
-    let config = path.display().to_string();
+    let folder = temporary_folder();
+    let text = format!("buses:\n  line: {{{}}}\ndevices:\n{MIXED}", peer.link());
+    let config = temporary_file(&folder, "busker.yaml", &text).display().to_string();
     let run = |verb: &str, rest: &[&str]| {
         let output = Command::new(program())
             .args([verb, "--config", &config, "--device", "one"])

@@ -6,7 +6,7 @@ use std::time::Duration;
 use serde_json::Value;
 
 use crate::peer::{Peer, Step, rtu};
-use crate::support::program;
+use crate::support::{program, temporary_file, temporary_folder};
 use crate::typed::terminal;
 
 fn doctor(arguments: &[&str]) -> Output {
@@ -105,17 +105,17 @@ fn what_cannot_be_looked_at_is_told_with_its_reason() {
     }
 
     // As the configuration wants it.
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let config = folder.path().join("busker.yaml");
+    let folder = temporary_folder();
     let text = format!("buses:\n  shed: {{serial: {path}, rs485: kernel}}\n");
-    std::fs::write(&config, text).expect("a temporary file");
-    let output = doctor(&["--config", &config.display().to_string(), "--listen", "0s", "--json"]);
+    let config = temporary_file(&folder, "shed.yaml", &text).display().to_string();
+    let output = doctor(&["--config", &config, "--listen", "0s", "--json"]);
     assert_eq!(
         found(&output, "RS485"),
         bad("the driver cannot switch the transceiver, as `rs485: kernel` wants it to")
     );
-    std::fs::write(&config, "buses: {plant: {tcp: \"127.0.0.1:502\"}}\n").expect("a temporary file");
-    let output = doctor(&["--config", &config.display().to_string()]);
+    let text = "buses: {plant: {tcp: \"127.0.0.1:502\"}}\n";
+    let config = temporary_file(&folder, "plant.yaml", text).display().to_string();
+    let output = doctor(&["--config", &config]);
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(doctor(&[]).status.code(), Some(2));
 }

@@ -1,13 +1,12 @@
 //! `busker identify` as somebody types it: who a device is, and whether it is the right one.
 
-use std::fs;
 use std::process::{Command, Output};
 
 use busker::simulator::Model;
 use serde_json::{Value, json};
 
-use crate::peer::{Framing, Peer, Step, exception};
-use crate::support::program;
+use crate::peer::{Framing, Peer, Step, exception, garbled};
+use crate::support::{program, temporary_file, temporary_folder};
 use crate::typed::{check, found, path, said, simulated};
 
 const DEVICES: &[(Model, u8)] = &[(Model::MrDo4, 18), (Model::Relay8, 19), (Model::Sensor, 20)];
@@ -51,16 +50,14 @@ fits       metz-connect/mr-do4
 fn another_device_than_the_one_of_the_profile_is_a_failure_that_says_who_it_is() {
     let (_simulation, port) = simulated(None, DEVICES, &["unit=18,wrong-identity"]);
     let path = path(&port);
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let file = folder.path().join("busker.yaml");
+    let folder = temporary_folder();
     let configuration = format!(
         "buses: {{line: {{serial: {path}}}}}\ndevices:\n  \
          relays: {{profile: metz-connect/mr-do4, bus: line, unit: 18}}\n  \
          board: {{profile: fuehlersysteme/relay8, bus: line, unit: 19}}\n  \
          air: {{profile: fuehlersysteme/sensor, bus: line, unit: 20}}\n"
     );
-    fs::write(&file, configuration).expect("a file");
-    let file = file.display().to_string();
+    let file = temporary_file(&folder, "busker.yaml", &configuration).display().to_string();
     let of_configuration = |device: &str| identify(&["--config", &file], &["--device", device]);
     let of_profile = |id: &str| identify(&["--serial", &path], &["--unit", "19", "--profile", id]);
     for (output, code, says) in [
@@ -105,11 +102,7 @@ fn silence_and_a_damaged_answer_are_told_apart() {
     let last = peer.asked().last().map(|asked| asked.function);
     assert_eq!(last, Some(3), "whoever knows nothing else knows a register");
 
-    peer.misbehave(|_, mut good| {
-        let middle = good.len() / 2;
-        good[middle] ^= 0x10;
-        vec![Step::Say(good)]
-    });
+    peer.misbehave(|_, good| vec![Step::Say(garbled(good))]);
     check(&ask(), 1, "checksum error; check the wire");
 
     // A refusal is an answer.

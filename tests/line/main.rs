@@ -14,12 +14,9 @@ mod settings;
 mod support;
 mod typed;
 
-use peer::{Asked, Framing, Misbehave, Peer, Step, read_pdu, reply, rtu};
+use peer::{ALIKE, Asked, Framing, LIE, Misbehave, Peer, Step, lie, read_pdu, reply, rtu};
 use serde_json::Value;
 use support::{Broker, Gateway, Watcher, wait_for};
-
-/// What no device ever holds.
-const LIE: u16 = 9999;
 
 /// How long the gateway waits for a reply, and then for a late one, in milliseconds.
 const TIMEOUT: u64 = 500;
@@ -155,10 +152,6 @@ const TCP_FAULTS: &[Fault] = &[
     },
     Fault { name: "single bytes", how: |_, good| in_single_bytes(good), counts: &[] },
 ];
-
-fn lie(asked: &Asked) -> Vec<u8> {
-    rtu(asked.unit, &read_pdu(4, &[LIE]))
-}
 
 fn tcp_lie(asked: &Asked) -> Vec<u8> {
     reply(asked, Framing::Tcp, &read_pdu(4, &[LIE]))
@@ -393,17 +386,6 @@ const MIXED: &str = "  one:
     unit: 2
     poll: {fast: 100ms}
     points: {a: {at: input 0, poll: fast}}
-";
-
-/// One unit, of which each reply could be that to each request.
-const ALIKE: &str = "  one:
-    bus: line
-    unit: 1
-    poll: {fast: 100ms}
-    wire: {limits: {gap: 0}}
-    points:
-      a: {at: input 0, poll: fast}
-      b: {at: input 100, poll: fast}
 ";
 
 /// The program on a peer's line, with a few devices.

@@ -8,9 +8,9 @@ use std::process::Command;
 use serde_json::{Value, json};
 
 use crate::pcapng::{self, Packet, Pcapng};
-use crate::peer::{Framing, Peer, Step, read_pdu, reply, rtu};
+use crate::peer::{Framing, Peer, Step, lie, read_pdu, reply, rtu};
 use crate::support::wait_for;
-use crate::{MIXED, Stage, changed, lie};
+use crate::{MIXED, Stage, changed};
 
 /// Units 1 and 2 have given their first values, a command was obeyed, and then unit 1 has sent a damaged
 /// answer and been silent once.

@@ -1,13 +1,12 @@
 //! `busker scan` as somebody types it, on simulated lines whose bit rate and parity nobody has told it.
 
-use std::fs;
 use std::process::{Command, Output};
 
 use busker::simulator::{Framing, Model, Parity};
 use serde_json::Value;
 
 use crate::peer::{self, Peer};
-use crate::support::{Ended, Running, program};
+use crate::support::{Ended, Running, program, temporary_file, temporary_folder};
 use crate::typed::{found, path, simulated};
 
 fn scan(arguments: &[&str]) -> Output {
@@ -57,9 +56,8 @@ devices:
     );
     assert_eq!(String::from_utf8_lossy(&output.stdout), expected);
 
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let file = folder.path().join("busker.yaml");
-    fs::write(&file, &output.stdout).expect("a file");
+    let folder = temporary_folder();
+    let file = temporary_file(&folder, "busker.yaml", &expected);
     let check =
         Command::new(program()).arg("check").arg("--config").arg(&file).output().expect("it is built");
     assert!(check.status.success(), "{check:?}");

@@ -6,8 +6,8 @@ use std::process::{Command, Output, Stdio};
 use busker::engine::time::Duration;
 use busker::simulator::{Model, Parity, PtyPort, Simulation};
 
-use crate::peer::{Asked, Framing, Peer, Step, exception, rtu};
-use crate::support::program;
+use crate::peer::{Asked, Framing, Peer, Step, exception, garbled, rtu};
+use crate::support::{program, temporary_file, temporary_folder};
 use crate::typed::{check, path, simulated, terminal};
 
 /// Devices that hear only who speaks with their bit rate and parity: 9600 8N1.
@@ -89,11 +89,7 @@ fn what_cannot_be_is_refused_with_what_would_be_right() {
 #[test]
 fn a_device_that_cannot_be_understood_is_not_written_to() {
     let peer = Peer::on_a_pseudo_terminal();
-    peer.misbehave(|_, mut good| {
-        let middle = good.len() / 2;
-        good[middle] ^= 0x10;
-        vec![Step::Say(good)]
-    });
+    peer.misbehave(|_, good| vec![Step::Say(garbled(good))]);
     let output = change(&peer, &["--yes", "--timeout", "300ms"], Stdio::null());
     check(&output, 1, "it does not answer with these settings: checksum error; check the wire");
     assert!(!peer.asked().is_empty());
@@ -232,8 +228,7 @@ fn where_the_port_is_gone_behind_the_write_it_is_told_what_was_written() {
 
 #[test]
 fn what_the_profile_demands_of_a_question_holds_for_these_as_well() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let profile = folder.path().join("slow.yaml");
+    let folder = temporary_folder();
     let text = "\
 device: acme/slow
 manufacturer: ACME
@@ -244,7 +239,7 @@ wire: {response_timeout: 5s, limits: {delay: 60ms}, quirks: [exception_function_
 line: {unit: a switch, at: holding 65, add: 0x5300, baud: {9600: 0x04, 19200: 0x05}, parity: {even: 0x10, none: 0x30}}
 points: {flow: {at: input 0, poll: slow}}
 ";
-    fs::write(&profile, text).expect("a file");
+    let profile = temporary_file(&folder, "slow.yaml", text).display().to_string();
     let peer = Peer::on_a_pseudo_terminal();
     peer.misbehave(|asked, _| {
         let answer = match asked.function {
@@ -253,7 +248,6 @@ points: {flow: {at: input 0, poll: slow}}
         };
         vec![Step::Pause(600), Step::Say(answer)]
     });
-    let profile = profile.display().to_string();
     let output = change(&peer, &["--yes", "--timeout", "200ms", "--profile", &profile], Stdio::null());
     check(&output, 0, "sent, and not confirmed: exception 4");
     let silences: Vec<_> = peer.asked().iter().skip(1).map(|asked| asked.silence).collect();

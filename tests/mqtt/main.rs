@@ -60,6 +60,18 @@ fn wait_until_all_is_online(watcher: &Watcher) {
     }
 }
 
+/// A gateway between its devices and a broker when all is online, and who watches that: in the reverse of the order in
+/// which they end.
+#[track_caller]
+fn all_online() -> ((TcpPort, Simulation), Broker, Watcher, Gateway) {
+    let (broker, simulation) = (Broker::start(), simulation());
+    let port = over_tcp(&simulation);
+    let watcher = Watcher::start(&broker, "watcher");
+    let gateway = Gateway::start(&broker, &configuration(&port));
+    wait_until_all_is_online(&watcher);
+    ((port, simulation), broker, watcher, gateway)
+}
+
 /// What a newcomer is told at once, by topic.
 fn remembered(broker: &Broker, name: &str) -> Vec<Received> {
     let newcomer = Watcher::start(broker, name);
@@ -81,11 +93,7 @@ fn json(text: &str) -> Json {
 
 #[test]
 fn the_broker_remembers_states_availability_and_discovery() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let gateway = Gateway::start(&broker, &configuration(&port));
-    wait_until_all_is_online(&watcher);
+    let (_devices, broker, watcher, gateway) = all_online();
     watcher.wait_for("busker/relays/relay_1", "OFF");
     watcher.wait_until("good health", |got| {
         got.topic == "busker/bridge/health" && json(&got.payload)["status"] == "ok"
@@ -139,11 +147,7 @@ fn everything_is_sent_again_when_the_broker_has_forgotten_it() {
 
 #[test]
 fn a_birth_message_is_answered_with_discovery_and_a_second_later_with_states() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let _gateway = Gateway::start(&broker, &configuration(&port));
-    wait_until_all_is_online(&watcher);
+    let (_devices, _broker, watcher, _gateway) = all_online();
 
     watcher.forget();
     watcher.publish("homeassistant/status", "online");
@@ -260,11 +264,7 @@ fn a_flood_of_commands_ends_with_the_newest_and_leaves_the_gateway_well() {
 
 #[test]
 fn the_last_message_is_offline_when_the_gateway_is_asked_to_end() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let gateway = Gateway::start(&broker, &configuration(&port));
-    wait_until_all_is_online(&watcher);
+    let (_devices, broker, watcher, gateway) = all_online();
     watcher.forget();
     let status = gateway.terminate();
     assert_eq!(status.code(), Some(0));
@@ -291,11 +291,7 @@ fn the_last_message_is_offline_when_the_gateway_is_asked_to_end() {
 
 #[test]
 fn the_last_will_says_offline_when_the_gateway_is_killed() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let gateway = Gateway::start(&broker, &configuration(&port));
-    wait_until_all_is_online(&watcher);
+    let (_devices, broker, watcher, gateway) = all_online();
     watcher.forget();
     gateway.kill();
     watcher.wait_for("busker/bridge/state", "offline");
@@ -358,11 +354,7 @@ fn what_the_configuration_has_no_more_is_taken_from_home_assistant() {
 
 #[test]
 fn http_tells_how_everything_is() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let gateway = Gateway::start(&broker, &configuration(&port));
-    wait_until_all_is_online(&watcher);
+    let ((port, simulation), _broker, watcher, gateway) = all_online();
     let (status, body) = gateway.get("/health");
     assert_eq!((status, json(&body)["status"].as_str()), (200, Some("ok")));
 

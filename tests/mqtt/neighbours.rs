@@ -2,7 +2,7 @@
 
 use serde_json::Value as Json;
 
-use super::{configuration, json, over_tcp, relay, remembered, simulation};
+use super::{all_online, configuration, json, over_tcp, relay, remembered, simulation};
 use crate::support::{self, Broker, Gateway, Received, Watcher};
 
 fn health(gateway: &Gateway) -> Json {
@@ -66,11 +66,7 @@ fn two_gateways_with_two_base_topics_leave_each_other_alone() {
 
 #[test]
 fn a_client_identifier_that_is_taken_is_told_once_and_the_pauses_grow() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let first = Gateway::start(&broker, &configuration(&port));
-    super::wait_until_all_is_online(&watcher);
+    let ((port, _simulation), broker, watcher, first) = all_online();
     let second = Gateway::start(&broker, &configuration(&port));
     let is_contested = |gateway: &Gateway| health(gateway)["broker"]["client_id_taken"] == true;
     support::find(|| (is_contested(&first) || is_contested(&second)).then_some(())).expect("it is noticed");
@@ -97,11 +93,7 @@ fn a_client_identifier_that_is_taken_is_told_once_and_the_pauses_grow() {
 
 #[test]
 fn a_state_that_somebody_else_has_told_is_put_right_at_once_but_not_without_end() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let gateway = Gateway::start(&broker, &configuration(&port));
-    super::wait_until_all_is_online(&watcher);
+    let (_devices, broker, watcher, gateway) = all_online();
     let state = "busker/bridge/state";
     let last = |name: &str| super::payload(&remembered(&broker, name), state).to_string();
     // The will of another gateway; a mistake; somebody who deletes it.

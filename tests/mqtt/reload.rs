@@ -496,7 +496,8 @@ fn a_hangup_while_the_gateway_starts_is_a_reload_and_not_its_end() {
     // Nobody can write into a pipe until somebody reads it: the gateway has begun, and cannot go on yet.
     let open = || {
         let pipe = wait_for("its reader", || {
-            rustix::fs::open(gateway.file(), OFlags::WRONLY | OFlags::NONBLOCK, Mode::empty()).ok()
+            let flags = OFlags::WRONLY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+            rustix::fs::open(gateway.file(), flags, Mode::empty()).ok()
         });
         File::from(pipe)
     };

@@ -6,7 +6,7 @@ use serde_json::Value as Json;
 use ureq::http::Response;
 use ureq::{Agent, Body};
 
-use super::{configuration, json, over_tcp, simulation, wait_until_all_is_online};
+use super::{all_online, configuration, json, over_tcp, simulation, wait_until_all_is_online};
 use crate::support::{Broker, Gateway, Watcher};
 
 const TOKEN: &str = "s3cret-of-the-test";
@@ -112,11 +112,7 @@ fn the_page_allows_a_browser_nothing_but_itself() {
 
 #[test]
 fn who_watches_is_told_everything_first_and_then_what_changes() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let gateway = Gateway::start(&broker, &configuration(&port));
-    wait_until_all_is_online(&watcher);
+    let ((_port, simulation), _broker, watcher, gateway) = all_online();
     watcher.wait_for("busker/relays/relay_3", "OFF");
 
     let mut events = Events::open(&gateway, None);
@@ -178,11 +174,7 @@ fn with_a_token_nothing_but_health_is_told_without_it() {
 
 #[test]
 fn a_page_from_elsewhere_that_leads_a_browser_here_is_told_nothing() {
-    let (broker, simulation) = (Broker::start(), simulation());
-    let port = over_tcp(&simulation);
-    let watcher = Watcher::start(&broker, "watcher");
-    let gateway = Gateway::start(&broker, &configuration(&port));
-    wait_until_all_is_online(&watcher);
+    let (_devices, _broker, _watcher, gateway) = all_online();
     let ask = |path: &str, host: &str| {
         let request = agent().get(format!("{}{path}", gateway.http())).header("Host", host);
         let mut answer = request.call().expect("HTTP answers");

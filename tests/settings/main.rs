@@ -110,10 +110,12 @@ fn what_is_dumped_from_one_device_makes_another_like_it() {
 
 /// The near end of a terminal at which somebody has typed this, and its far end, which is to be kept.
 fn terminal(typed: &str) -> (File, File) {
-    let far = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pseudo-terminal");
+    let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
+    let far = openpt(flags).expect("a pseudo-terminal");
     unlockpt(&far).expect("a pseudo-terminal");
     let near = ptsname(&far, Vec::new()).expect("its name");
-    let near = rustix::fs::open(&near, OFlags::RDWR | OFlags::NOCTTY, Mode::empty()).expect("its near end");
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC;
+    let near = rustix::fs::open(&near, flags, Mode::empty()).expect("its near end");
     let mut far = File::from(far);
     far.write_all(typed.as_bytes()).expect("it is typed");
     (File::from(near), far)

@@ -2,9 +2,6 @@
 
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
-use busker::simulator::LineSettings;
-use busker::simulator::device::Place;
-use busker::simulator::line::Line;
 use busker::simulator::script::Action;
 
 use crate::device::{BLOCK, Diary, Timepiece};
@@ -213,13 +210,7 @@ fn world(units: u8) -> World {
 }
 
 fn world_polled(units: u8, poll: &str) -> World {
-    let turnaround = Duration::from_millis(5);
-    let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
-    for unit in 1..=units {
-        let at = Place { unit, device: format!("unit_{unit}") };
-        line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
-    }
-    World::new(gateway(units, poll), line)
+    World::with_devices(gateway(units, poll), |unit| Box::new(Timepiece::new(unit, Diary::default())))
 }
 
 fn gateway(units: u8, poll: &str) -> Settings {

@@ -3,9 +3,6 @@
 use busker::engine::bus::{Command, Event};
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
-use busker::simulator::LineSettings;
-use busker::simulator::device::Place;
-use busker::simulator::line::Line;
 
 use crate::device::{BLOCK, BLOCKS, Diary, Timepiece};
 use crate::load;
@@ -187,13 +184,7 @@ fn requests(world: &World, from: Time) -> Vec<(Time, u8)> {
 
 /// Units from 1 on with two blocks of readings each, and a register that is written.
 fn world(units: u8, poll: &str) -> World {
-    let turnaround = Duration::from_millis(5);
-    let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
-    for unit in 1..=units {
-        let at = Place { unit, device: format!("device_{unit}") };
-        line.add(at, Box::new(Timepiece::new(unit, Diary::default()))).expect("a unit of its own");
-    }
-    World::new(gateway(units, poll), line)
+    World::with_devices(gateway(units, poll), |unit| Box::new(Timepiece::new(unit, Diary::default())))
 }
 
 fn gateway(units: u8, poll: &str) -> Settings {

@@ -8,12 +8,14 @@ mod dead_unit;
 mod device;
 mod faults;
 mod losses;
+#[path = "../support/number.rs"]
+mod number;
 mod profiles;
 mod refusals;
 mod watched;
 mod world;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
 use busker::engine::bus::{Command, Event};
@@ -21,14 +23,14 @@ use busker::engine::configuration;
 use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
-use busker::simulator::device::Place;
-use busker::simulator::line::Line;
+use busker::simulator::Fault;
+use busker::simulator::device::SimulatedDevice;
 use busker::simulator::script::Action;
-use busker::simulator::{Fault, LineSettings};
 use fastrand::Rng;
 
 use device::{BLOCK, BLOCKS, Diary, STORED, Store, Timepiece, held};
 use faults::FAULTS;
+use number::number;
 use world::{Published, World};
 
 /// The units; the addresses between them belong to nobody, so that a device with a wrong address is
@@ -66,9 +68,10 @@ fn live(usual: u64, link: Link, always: Option<&str>) {
         Soak::new(seed, link, always).run(&mut seen);
     }
     println!("{seen:?}");
-    if !seeds.are_usual {
+    if !seeds.are_enough {
         return;
     }
+    assert!(FAULTS.iter().all(|kind| seen.faults.contains(*kind)), "{seen:?}");
     assert!(seen.values > 5_000 && seen.missing > 250, "{seen:?}");
     assert_eq!(seen.collisions > 0, link == Link::Serial, "{seen:?}");
     for kind in ["done", "no_reply", "expired", "refused"] {
@@ -79,17 +82,22 @@ fn live(usual: u64, link: Link, always: Option<&str>) {
 /// Which lives are lived.
 struct Seeds {
     all: Range<u64>,
-    /// Of these it is known what happens in them; in one that is repeated perhaps nothing does.
-    are_usual: bool,
+    /// Something of every kind happens in them: in the usual ones it is known to, and in so many others it does. In one
+    /// that is repeated perhaps nothing does.
+    are_enough: bool,
+    are_many: bool,
 }
 
 impl Seeds {
+    const MANY: u64 = 10;
+
     /// So many as usual, or those that whoever looks for something rare wants.
     fn wanted(usual: u64) -> Seeds {
-        let number = |name| std::env::var(name).ok().map(|number| number.parse::<u64>().expect("a number"));
-        let (first, count) = (number("FIRST_SEED"), number("SEEDS"));
-        let begin = first.unwrap_or(1);
-        Seeds { all: begin..begin + count.unwrap_or(usual), are_usual: first.is_none() && count.is_none() }
+        let begin = number("FIRST_SEED").unwrap_or(1);
+        let count = number("SEEDS").unwrap_or(usual);
+        let are_many = count >= Seeds::MANY * usual;
+        let are_enough = are_many || (begin == 1 && count >= usual);
+        Seeds { all: begin..begin + count, are_enough, are_many }
     }
 }
 
@@ -100,6 +108,8 @@ struct Seen {
     missing: usize,
     collisions: u32,
     outcomes: BTreeMap<String, usize>,
+    /// Which kinds befell a device.
+    faults: BTreeSet<String>,
 }
 
 /// How the devices are reached.
@@ -131,17 +141,12 @@ struct Sent {
 impl Soak {
     fn new(seed: u64, link: Link, always: Option<&str>) -> Soak {
         let diary = Diary::default();
-        let turnaround = Duration::from_millis(5);
-        let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
-        for unit in UNITS {
-            let at = Place { unit, device: device_name(unit) };
-            line.add(at, Box::new(Timepiece::new(unit, diary.clone()))).expect("a unit of its own");
-        }
+        let timepiece = |unit| Box::new(Timepiece::new(unit, diary.clone())) as Box<dyn SimulatedDevice>;
+        let mut world = World::with_devices(gateway(link), timepiece);
         let always = always.map(|fault| fault.parse::<Fault>().expect("a fault"));
         if let Some(fault) = &always {
-            line.add_fault(Time(0), fault).expect("all units");
+            world.line.add_fault(Time(0), fault).expect("all units");
         }
-        let world = World::new(gateway(link), line);
         Soak { random: Rng::with_seed(seed), link, always, world, diary, commands: Vec::new() }
     }
 
@@ -162,6 +167,7 @@ impl Soak {
         self.check_commands(seen);
         self.check_end();
         seen.collisions += self.world.collisions;
+        seen.faults.extend(self.world.faults);
     }
 
     fn something_happens(&mut self) {

@@ -6,7 +6,7 @@
 mod checks;
 mod choices;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use busker::engine::arrivals::Errand;
@@ -54,8 +54,12 @@ fn lives_of_real_profiles_bring_nothing_false() {
         Life::new(seed).run(&mut seen);
     }
     println!("{seen:?}");
-    if !seeds.are_usual {
+    if !seeds.are_enough {
         return;
+    }
+    if seeds.are_many {
+        let mut kinds = FAULTS.iter().chain(OF_PROFILES);
+        assert!(kinds.all(|kind| seen.faults.contains(*kind)), "{seen:?}");
     }
     assert!(seen.values > 500 && seen.decided > 100 && seen.writes["to EEPROM"] > 10, "{seen:?}");
     for kind in ["done", "unchanged", "expired", "refused"] {
@@ -73,6 +77,8 @@ struct Seen {
     excused: usize,
     outcomes: BTreeMap<String, usize>,
     writes: BTreeMap<&'static str, usize>,
+    /// Which kinds befell a device: in a single life not all of them.
+    faults: BTreeSet<String>,
 }
 
 struct Unit {
@@ -238,6 +244,7 @@ impl Life {
         self.check_writes(seen);
         self.check_counters();
         self.check_end();
+        seen.faults.extend(self.world.faults);
     }
 
     fn come_back(&mut self) {

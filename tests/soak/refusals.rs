@@ -7,10 +7,9 @@ use busker::engine::address::{Span, Table};
 use busker::engine::bus::{Command, Event};
 use busker::engine::settings::Settings;
 use busker::engine::time::{Duration, Time};
-use busker::simulator::device::{Place, SimulatedDevice};
-use busker::simulator::line::Line;
+use busker::simulator::Stimulus;
+use busker::simulator::device::SimulatedDevice;
 use busker::simulator::script::Action;
-use busker::simulator::{LineSettings, Stimulus};
 
 use crate::device::{BLOCK, BLOCKS, Diary, STORED, Timepiece};
 use crate::watched::{Holes, Ledger, Watched};
@@ -36,12 +35,7 @@ fn what_is_refused_for_a_moment_is_read_in_one_request_again() {
         }
         world.fault(UNIT, "exception=2");
         world.run_until(world.now + Duration::from_secs(5));
-        world.act(UNIT, &Action::Repair { unit: UNIT });
-        world.run_until(world.now + Duration::from_secs(70));
-        assert_eq!(requests(&mut world, 10), 10 * EACH_SECOND, "restarts: {restarts}");
-        // And nothing of it is remembered.
-        let memory = world.memories.devices.get(&device_name(UNIT));
-        assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{memory:?}");
+        check_that_it_is_over(&mut world, &format!("restarts: {restarts}"));
     }
 }
 
@@ -55,12 +49,18 @@ fn a_device_that_was_busy_for_long_and_then_refuses_something_once_has_not_refus
         world.act(UNIT, &Action::Repair { unit: UNIT });
         world.fault(UNIT, "exception=2");
         world.run_until(world.now + Duration::from_secs(3));
-        world.act(UNIT, &Action::Repair { unit: UNIT });
-        world.run_until(world.now + Duration::from_secs(70));
-        assert_eq!(requests(&mut world, 10), 10 * EACH_SECOND, "{before}");
-        let memory = world.memories.devices.get(&device_name(UNIT));
-        assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{before}: {memory:?}");
+        check_that_it_is_over(&mut world, before);
     }
+}
+
+/// Once the unit is well again all is soon read as before, and nothing of it is remembered.
+#[track_caller]
+fn check_that_it_is_over(world: &mut World, what: &str) {
+    world.act(UNIT, &Action::Repair { unit: UNIT });
+    world.run_until(world.now + Duration::from_secs(70));
+    assert_eq!(requests(world, 10), 10 * EACH_SECOND, "{what}");
+    let memory = world.memories.devices.get(&device_name(UNIT));
+    assert!(memory.is_none_or(|memory| memory.refused.is_empty()), "{what}: {memory:?}");
 }
 
 #[test]
@@ -203,13 +203,11 @@ fn world(link: &str, fast: &str) -> World {
 }
 
 fn world_with(settings: Settings, of_unit: Box<dyn SimulatedDevice>) -> World {
-    let turnaround = Duration::from_millis(5);
-    let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
-    let of_other: Box<dyn SimulatedDevice> = Box::new(Timepiece::new(OTHER, Diary::default()));
-    for (unit, device) in [(UNIT, of_unit), (OTHER, of_other)] {
-        line.add(Place { unit, device: device_name(unit) }, device).expect("a unit of its own");
-    }
-    World::new(settings, line)
+    let mut of_unit = Some(of_unit);
+    World::with_devices(settings, |unit| match unit {
+        UNIT => of_unit.take().expect("there is one"),
+        other => Box::new(Timepiece::new(other, Diary::default())),
+    })
 }
 
 fn gateway(link: &str, fast: &str) -> Settings {

@@ -1,7 +1,7 @@
 //! A bus, its guard and a line of simulated devices, joined without threads, ports and clocks: an hour
 //! passes as fast as it can be calculated.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use busker::engine::bus::{Action, Bus, Event};
 use busker::engine::health::BusReport;
@@ -11,10 +11,10 @@ use busker::engine::modbus::{Reply, RequestError};
 use busker::engine::settings::{Link, Settings};
 use busker::engine::time::{Duration, Time};
 use busker::engine::topics::Message;
-use busker::simulator::Framing;
+use busker::simulator::device::{Place, SimulatedDevice};
 use busker::simulator::line::{Line, Transmission};
-use busker::simulator::script;
 use busker::simulator::wire::{Receiver, character_time};
+use busker::simulator::{Framing, LineSettings, script};
 
 pub struct World {
     pub now: Time,
@@ -40,6 +40,8 @@ pub struct World {
     frames: Vec<(Time, u8, String)>,
     /// So often two spoke at the same time.
     pub collisions: u32,
+    /// What befell a device, of whichever kind.
+    pub faults: BTreeSet<String>,
     /// What spoils characters again and again, for ever.
     pub disturbance: Option<Disturbance>,
     /// So many requests have been sent since there was one.
@@ -90,6 +92,20 @@ enum Port {
 }
 
 impl World {
+    /// A usual line, with the device that `simulated` makes for each unit.
+    pub fn with_devices(
+        settings: Settings,
+        mut simulated: impl FnMut(u8) -> Box<dyn SimulatedDevice>,
+    ) -> World {
+        let turnaround = Duration::from_millis(5);
+        let mut line = Line::new(Time(0), LineSettings::default(), turnaround, true, &[]).expect("a line");
+        for device in &settings.devices {
+            let at = Place { unit: device.unit, device: device.name.clone() };
+            line.add(at, simulated(device.unit)).expect("a unit of its own");
+        }
+        World::new(settings, line)
+    }
+
     pub fn new(settings: Settings, line: Line) -> World {
         let now = Time(0);
         let framing = match &settings.buses[0].link {
@@ -113,6 +129,7 @@ impl World {
             published: Vec::new(),
             frames: Vec::new(),
             collisions: 0,
+            faults: BTreeSet::new(),
             disturbance: None,
             disturbed_requests: 0,
             memories: Memories::default(),
@@ -162,6 +179,7 @@ impl World {
 
     /// From now on the device does something that it should not.
     pub fn fault(&mut self, unit: u8, fault: &str) {
+        self.faults.insert(fault.into());
         let fault = format!("unit={unit},{fault}").parse().expect("a fault");
         self.act(unit, &script::Action::Fault(fault));
     }

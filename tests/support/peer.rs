@@ -17,6 +17,20 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 use tempfile::TempDir;
 
+/// What no device ever holds.
+pub const LIE: u16 = 9999;
+
+/// The configuration of one unit of which each reply could be that to each request.
+pub const ALIKE: &str = "  one:
+    bus: line
+    unit: 1
+    poll: {fast: 100ms}
+    wire: {limits: {gap: 0}}
+    points:
+      a: {at: input 0, poll: fast}
+      b: {at: input 100, poll: fast}
+";
+
 /// A request as it came.
 #[derive(Clone, Debug)]
 pub struct Asked {
@@ -445,6 +459,11 @@ pub fn read_pdu(function: u8, words: &[u16]) -> Vec<u8> {
     [&[function, bytes.len() as u8], &bytes[..]].concat()
 }
 
+/// An answer to a read of one input register that is none of the device's.
+pub fn lie(asked: &Asked) -> Vec<u8> {
+    rtu(asked.unit, &read_pdu(4, &[LIE]))
+}
+
 /// A refusal.
 pub fn exception(asked: &Asked, framing: Framing, code: u8) -> Vec<u8> {
     reply(asked, framing, &[asked.function | 0x80, code])
@@ -460,6 +479,13 @@ pub fn reply(asked: &Asked, framing: Framing, pdu: &[u8]) -> Vec<u8> {
             [&asked.frame[..2], &[0, 0], &length, &[asked.unit], pdu].concat()
         }
     }
+}
+
+/// The frame with a bit of it turned over.
+pub fn garbled(mut frame: Vec<u8>) -> Vec<u8> {
+    let middle = frame.len() / 2;
+    frame[middle] ^= 0x10;
+    frame
 }
 
 /// An RTU frame.

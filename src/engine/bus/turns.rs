@@ -68,18 +68,18 @@ impl Bus {
                     continue;
                 }
                 self.pace.idle(now);
-                self.nobody_was_kept_waiting();
+                self.nobody_was_kept_waiting(now);
                 return;
             };
             self.poll(device, polled);
         }
     }
 
-    /// Nothing that is due may be asked: what went out of turn has kept no read waiting, but for those of a device that
-    /// wants silence behind it.
-    fn nobody_was_kept_waiting(&mut self) {
+    /// A read had its turn, or nothing that is due may be asked: what went out of turn keeps no read waiting any more,
+    /// but for those of a device that wanted silence behind it when that was decided.
+    fn nobody_was_kept_waiting(&mut self, decided_at: Time) {
         let at = self.pace.at(self.now);
-        if self.ahead > 0 && !self.askable().any(|(_, device)| device.keeps_waiting(at)) {
+        if self.ahead > 0 && !self.askable().any(|(_, device)| device.keeps_waiting(at, decided_at)) {
             self.ahead = 0;
         }
     }
@@ -109,7 +109,7 @@ impl Bus {
         if ended.out_of_turn {
             self.ahead += 1;
         } else if matches!(ended.purpose, Purpose::Poll { .. }) {
-            self.ahead = 0;
+            self.nobody_was_kept_waiting(ended.decided_at);
         }
     }
 
@@ -125,7 +125,7 @@ impl Bus {
         });
         let longest = overdue.reduce(|best, other| if other.2 > best.2 { other } else { best });
         let Some((device, polled, _)) = longest else {
-            self.nobody_was_kept_waiting();
+            self.nobody_was_kept_waiting(self.now);
             return false;
         };
         self.ahead = 0;

@@ -45,10 +45,11 @@ impl DeviceState {
         }
     }
 
-    /// Whether something is due, and only the silence that it wants is in its way.
-    pub(in crate::engine::bus) fn keeps_waiting(&self, at: Moment) -> bool {
-        let is_due = || self.polls.due_at(at).is_some_and(|due| due <= at.now);
-        at.now < self.not_before() && self.is_present() && is_due()
+    /// Whether something is due, and not only since it is wanted at once, and only the silence that it wants behind what
+    /// went out of turn was in its way when it was decided what is asked instead.
+    pub(in crate::engine::bus) fn keeps_waiting(&self, at: Moment, decided_at: Time) -> bool {
+        let has_waited = || self.polls.longest_waiting(at).is_some();
+        self.was_asked_out_of_turn && decided_at < self.not_before() && self.is_present() && has_waited()
     }
 
     /// Before, it is not asked because something is due.
