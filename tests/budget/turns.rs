@@ -317,10 +317,7 @@ impl Case {
             Trouble::Nothing => self.look_for_starving(&times, span, Unit::cost),
             Trouble::Leaves(_) | Trouble::Refuses(..) => {
                 times.retain(|(of, _), _| *of != number);
-                // What is busy is asked again soon, before all others.
-                let is_busy = matches!(trouble, Trouble::Refuses(_, 5 | 6));
-                let of_others = if is_busy { AHEAD * unit.cost() } else { 0.0 };
-                self.look_for_starving(&times, span, |of| of.cost() + of_others)
+                self.look_for_starving(&times, span, Unit::cost)
             }
             Trouble::Collisions(_) => self.look_for_starving(&times, span, |of| of.cost() + COLLISION),
             // Others have to wait for its silence, and it is asked as seldom as it pleases.
@@ -500,4 +497,40 @@ fn a_read_that_collides_each_time_comes_no_more_often() {
     line.asked.clear();
     line.run_for(60_000).expect("no fault");
     assert!((59..=61).contains(&line.asked.len()), "{}", line.asked.len());
+}
+
+/// On a bus that cannot keep up the others have no less while a device is busy, and it is asked nearly as often as
+/// before.
+#[test]
+fn a_device_that_is_busy_takes_no_turns_from_others() {
+    let unit = |fast, fast_reads| Unit {
+        fast,
+        slow: fast,
+        cost: 30,
+        rest: 0,
+        fast_reads,
+        slow_reads: 0,
+        once_reads: 0,
+    };
+    let units = vec![unit(4_000, 8), unit(50, 2)];
+    let case = Case { is_network: true, closes: false, units, troubles: Vec::new() };
+    let mut line = Plain::new(&case.configuration(), vec![30; 2]);
+    line.run_for(SETTLES).expect("no fault");
+    line.asked.clear();
+    let turns_in = |line: &mut Plain, millis: u64| {
+        line.run_for(millis).expect("no fault");
+        let of_other = line.asked.iter().filter(|asked| asked.unit == 2).count();
+        let all = std::mem::take(&mut line.asked).len();
+        [all - of_other, of_other]
+    };
+    for code in [5, 6] {
+        let [turns, usual] = turns_in(&mut line, 10_000);
+        line.refuses = Some((0, code));
+        let [asked, meanwhile] = turns_in(&mut line, 10_000);
+        assert!(meanwhile >= usual * 99 / 100, "exception {code}: {meanwhile} turns instead of {usual}");
+        assert!(asked * 3 >= turns * 2, "exception {code}: {asked} times instead of {turns}");
+        line.refuses = None;
+        line.run_for(FORGOTTEN).expect("no fault");
+        line.asked.clear();
+    }
 }
