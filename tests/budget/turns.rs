@@ -458,6 +458,18 @@ fn nobody_starves_where_somebody_did() {
             Trouble::Gets(0, 20),
         ),
         (
+            "the same beside others: they had their turns in its silence, and that counted as if it had had one",
+            false,
+            vec![unit([20, 20, 1, 0], [1, 0]), unit([20, 20, 1, 21], [2, 0])],
+            Trouble::Gets(1, 5),
+        ),
+        (
+            "commands for it that come in its silence, beside others that have their turns in that",
+            false,
+            vec![unit([20, 20, 1, 0], [1, 0]), unit([20, 20, 1, 21], [2, 0])],
+            Trouble::SomeCommands(1, 44),
+        ),
+        (
             "a server that closes each connection: the bus was taken to be done with everything at each new one",
             true,
             vec![unit([11, 66, 8, 0], [2, 3]), unit([7, 77, 1, 0], [4, 0])],

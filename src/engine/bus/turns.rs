@@ -108,9 +108,16 @@ impl Bus {
         }
         if ended.out_of_turn {
             self.ahead += 1;
-        } else if matches!(ended.purpose, Purpose::Poll { .. }) {
+        } else if matches!(ended.purpose, Purpose::Poll { .. }) && !self.is_silence_filled() {
             self.ahead = 0;
         }
+    }
+
+    /// Whether reads of a device wait for what goes out of turn for the same device, while others have their turns in
+    /// the silence that it wants behind each.
+    fn is_silence_filled(&self) -> bool {
+        let at = self.pace.at(self.now);
+        self.ahead > 0 && self.askable().any(|(_, device)| device.waits_for_its_own(at))
     }
 
     /// A read that is due, after [`AHEAD_OF_READS`] requests that went before it.

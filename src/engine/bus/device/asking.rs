@@ -47,8 +47,17 @@ impl DeviceState {
 
     /// Whether something is due, and only the silence that it wants is in its way.
     pub(in crate::engine::bus) fn keeps_waiting(&self, at: Moment) -> bool {
-        let is_due = || self.polls.due_at(at).is_some_and(|due| due <= at.now);
-        at.now < self.not_before() && self.is_present() && is_due()
+        at.now < self.not_before() && self.is_due(at)
+    }
+
+    /// Whether something is due, but what was asked last was wanted at once, and it wants silence behind that.
+    pub(in crate::engine::bus) fn waits_for_its_own(&self, at: Moment) -> bool {
+        let wants_silence = !self.settings.device.wire.limits.delay.is_zero();
+        wants_silence && self.was_asked_out_of_turn && self.is_due(at)
+    }
+
+    fn is_due(&self, at: Moment) -> bool {
+        self.is_present() && self.polls.due_at(at).is_some_and(|due| due <= at.now)
     }
 
     /// Before, it is not asked because something is due.
