@@ -371,15 +371,22 @@ impl Case {
         for (read, period) in self.periods() {
             let Some(asked) = times.get(&read).filter(|asked| asked.len() > ROUNDS) else { continue };
             let found = (asked[asked.len() - 1] - asked[0]).as_secs_f64() / (asked.len() - 1) as f64;
-            let unit = &self.units[usize::from(read.0) - 1];
-            // It cannot be asked twice in a row where there are others, and decides itself how much slower that makes it.
-            let is_often_asked = unit.reads_a_second() * (unit.rest() + unit.cost()) > 0.5;
-            let has_to_rest = unit.rest > 0 && (is_often_asked || self.load(Unit::cost) > KEEPS_UP);
-            if !has_to_rest {
-                stretches.push(found / period);
-            }
+            stretches.push((read.0, found / period));
         }
-        stretches
+        let least = stretches.iter().map(|(_, stretch)| *stretch).fold(f64::MAX, f64::min);
+        let can_be_had = |unit: u8| self.slower_for_its_silence(unit) < least * NEARLY;
+        stretches.iter().filter(|(unit, _)| can_be_had(*unit)).map(|(_, stretch)| *stretch).collect()
+    }
+
+    /// By how much a unit's periods are longer at least. Nobody waits for the end of its silence: behind that it
+    /// waits in turn for what another one was asked meanwhile.
+    fn slower_for_its_silence(&self, number: u8) -> f64 {
+        let index = usize::from(number) - 1;
+        let unit = &self.units[index];
+        let others = self.units.iter().enumerate().filter(|(other, _)| *other != index);
+        let begun = others.map(|(_, other)| other.cost()).fold(0.0, f64::max);
+        let of_request = if unit.rest > 0 { unit.cost() + unit.rest() + begun } else { 0.0 };
+        unit.reads_a_second() * of_request
     }
 
     /// Where the bus keeps up so does each read; where it does not all are slower by the same factor.
@@ -400,6 +407,8 @@ const AHEAD: f64 = 8.0;
 const SLOWER: u64 = 5;
 /// What a request that meets another takes until it is asked again.
 const COLLISION: f64 = 0.6;
+/// So much of what a unit with a silence of its own can have it does have.
+const NEARLY: f64 = 0.95;
 /// A bus keeps up at less, and does not at more.
 const KEEPS_UP: f64 = 0.7;
 const OVERLOADED: f64 = 1.1;
