@@ -51,9 +51,9 @@ struct Planned {
     sleeps: bool,
 }
 
-/// For so long what nobody has answered waits behind everything that is due, also behind what has had more than its
-/// share: or a device that dies would keep the line from it twice in a row. On a bus that is never done with that
-/// its turn comes nevertheless.
+/// For so long what was asked in vain waits behind everything that is due, also behind what has had more than its
+/// share: or a device that dies would keep the line from it twice in a row, and one that is busy again and again. On
+/// a bus that is never done with that its turn comes nevertheless.
 const REPEATED_BEHIND: Duration = Duration::from_secs(2);
 
 /// A read that comes at least so often, and has been answered so often since its device connected, holds no
@@ -377,8 +377,9 @@ impl Polls {
 
     /// Nothing came of the read, for the moment. It is the next that is asked, if it `goes_first`; else it is due at
     /// once, but goes before nothing else that is due: a device that dies must not keep the line from all others
-    /// until it counts as dead. What has not been answered since the device connected is wanted as before: the device is
-    /// not there for anybody until it is, and on a line that is full its period may last for minutes.
+    /// until it counts as dead, nor one that is busy until it is done. What has not been answered since the device
+    /// connected is wanted as before: the device is not there for anybody until it is, and on a line that is full its
+    /// period may last for minutes.
     pub fn try_again(&mut self, index: usize, now: Time, goes_first: bool) {
         let planned = &mut self.reads[index];
         planned.answers = planned.answers.min(ANSWERS_WELL_KNOWN - ANSWERS_TO_FORGIVE);

@@ -31,7 +31,8 @@ fn one_of<T: Copy>(random: &mut Rng, all: &[T]) -> T {
 struct Case {
     configuration: String,
     turnaround: u64,
-    units: u8,
+    /// The silence that each unit wants, in seconds.
+    delays: Vec<f64>,
 }
 
 fn case(seed: u64) -> Case {
@@ -45,11 +46,13 @@ fn case(seed: u64) -> Case {
         0 => "tcp: \"10.0.0.1:502\"".to_string(),
         _ => format!("serial: /dev/serial/by-id/usb-A, baud: {baud}, parity: {parity}"),
     };
+    let mut delays = Vec::new();
     let mut configuration = format!("buses:\n  line: {{{link}, response_timeout: 500ms}}\ndevices:\n");
     for unit in 1..=units {
         let fast = log(random, 30.0, 3000.0) * busy;
         let slow = fast * (1 + random.u64(..15));
         let delay = if random.u64(..4) == 0 { log(random, 5.0, 200.0) } else { 0 };
+        delays.push(delay as f64 / 1e3);
         let apart = one_of(random, &[1, 1, 2, 9]);
         let mut points = Vec::new();
         for number in 0..1 + random.u64(..20) {
@@ -74,7 +77,7 @@ fn case(seed: u64) -> Case {
              poll: {{fast: {fast}ms, slow: 60s}}, settings: {{watchdog: {watchdog}}}}}"
         );
     }
-    Case { configuration, turnaround, units: units as u8 }
+    Case { configuration, turnaround, delays }
 }
 
 /// So many cases, and one of them is a network; and so many, and one of them has a device with a watchdog.
@@ -106,7 +109,8 @@ fn what_is_forecast_of_any_configuration_is_what_its_bus_does() {
 
 /// `compared` counts the periods that were held against each other.
 fn faults_of(seed: u64, compared: &AtomicUsize) -> Vec<String> {
-    let Case { configuration, turnaround, units } = case(seed);
+    let Case { configuration, turnaround, delays } = case(seed);
+    let units = delays.len() as u8;
     let forecast = check(&configuration, &["--turnaround", &format!("{turnaround}ms")])["buses"][0].clone();
     let mut wire = Wire::new(&configuration, Duration::from_millis(turnaround));
     wire.run_until(Time::from_millis(60_000));
@@ -147,7 +151,7 @@ fn faults_of(seed: u64, compared: &AtomicUsize) -> Vec<String> {
     }
     assert!(told > 0, "seed {seed} shows nothing");
     if load > OVERLOADED {
-        let stretches = stretches(&configuration, &forecast, &wire, &counts);
+        let stretches = stretches(&delays, &forecast, &wire, &counts);
         faults.extend(fault_of_stretches(seed, &stretches));
         // One alone is as slow as itself.
         if stretches.len() > 1 {
@@ -161,27 +165,19 @@ fn faults_of(seed: u64, compared: &AtomicUsize) -> Vec<String> {
     faults
 }
 
-/// By how much the periods are longer than they should be, but for those of units that want silence: how long that makes
-/// them wait, they decide themselves.
-fn stretches(
-    configuration: &str,
-    forecast: &Json,
-    wire: &Wire,
-    counts: &BTreeMap<(u8, u16), usize>,
-) -> Vec<f64> {
-    let rests = |unit: u8| {
-        let unit = format!("  unit_{unit}:");
-        !configuration.lines().any(|line| line.starts_with(&unit) && line.contains("delay: 0ms"))
-    };
-    let stretch = |unit: u8, address: u16, found: f64| {
-        let class = if address >= SLOW_FROM { "slow" } else { "fast" };
-        found
-            / forecast["devices"][usize::from(unit) - 1]["polls"][class]["period"].as_f64().expect("a period")
-    };
-    let periods = wire.periods().into_iter();
-    let counted =
-        periods.filter(|(read, _)| counts[read] >= ROUNDS_OF_STRETCH && read.0 != RELAYS && !rests(read.0));
-    counted.map(|((unit, address), found)| stretch(unit, address, found)).collect()
+/// By how much the periods are longer than they should be, but for those of a unit that its silence keeps from its share.
+fn stretches(delays: &[f64], forecast: &Json, wire: &Wire, counts: &BTreeMap<(u8, u16), usize>) -> Vec<f64> {
+    let mut stretches = Vec::new();
+    for ((unit, address), found) in wire.periods() {
+        if counts[&(unit, address)] >= ROUNDS_OF_STRETCH && unit != RELAYS {
+            let class = if address >= SLOW_FROM { "slow" } else { "fast" };
+            let period = &forecast["devices"][usize::from(unit) - 1]["polls"][class]["period"];
+            stretches.push((unit, found / period.as_f64().expect("a period")));
+        }
+    }
+    let least = stretches.iter().map(|(_, stretch)| *stretch).fold(f64::MAX, f64::min);
+    stretches.retain(|(unit, _)| slower_for_its_silence(*unit, delays, forecast) < least * (1.0 - WITHIN));
+    stretches.into_iter().map(|(_, stretch)| stretch).collect()
 }
 
 /// All are stretched by the same factor.
@@ -190,6 +186,27 @@ fn fault_of_stretches(seed: u64, stretches: &[f64]) -> Option<String> {
     let most = stretches.iter().copied().fold(0.0, f64::max);
     println!("seed {seed}: {} reads, stretched by {least:.3} to {most:.3}", stretches.len());
     (most > least * (1.0 + WITHIN)).then(|| format!("seed {seed}: stretched by {stretches:.3?}"))
+}
+
+/// By how much longer a unit's periods are at least, for the silence that it wants: nobody waits for its end, and what
+/// another one is asked meanwhile may last beyond it.
+fn slower_for_its_silence(unit: u8, delays: &[f64], forecast: &Json) -> f64 {
+    let of_class = |polls: &Json| ["reads", "seconds", "period"].map(|name| polls[name].as_f64());
+    let classes = |index: usize| {
+        let polls = &forecast["devices"][index]["polls"];
+        ["fast", "slow"].into_iter().filter_map(move |class| match of_class(&polls[class]) {
+            [Some(reads), Some(seconds), Some(period)] => Some((reads, seconds, period)),
+            _ => None,
+        })
+    };
+    let index = usize::from(unit) - 1;
+    if delays[index] == 0.0 {
+        return 0.0;
+    }
+    let others = (0..delays.len()).filter(|other| *other != index);
+    let longest = others.flat_map(classes).map(|(reads, seconds, _)| seconds / reads).fold(0.0, f64::max);
+    let wanted = |(reads, seconds, period)| (seconds + reads * (delays[index] + longest)) / period;
+    classes(index).map(wanted).sum()
 }
 
 /// Where the load is said to be more than this every period is longer than it should be.

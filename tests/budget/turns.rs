@@ -87,6 +87,12 @@ fn nobody_starves_where_somebody_did() {
             Trouble::Gets(1, 5),
         ),
         (
+            "commands for it that come in its silence, beside another that has its turns in that",
+            false,
+            vec![unit([20, 20, 1, 0], [1, 0]), unit([20, 20, 1, 21], [2, 0])],
+            Trouble::SomeCommands(1, 44),
+        ),
+        (
             "a server that closes each connection: the bus was taken to be done with everything at each new one",
             true,
             vec![unit([11, 66, 8, 0], [2, 3]), unit([7, 77, 1, 0], [4, 0])],
@@ -141,6 +147,42 @@ fn a_device_that_rests_and_is_busy_is_asked_when_the_bus_wakes_and_not_before() 
     let troubles = vec![(Trouble::Refuses(1, 5), 10_497)];
     let case = Case { is_network: false, closes: false, units: units.to_vec(), troubles };
     live(&case).unwrap_or_else(|fault| panic!("{fault}"));
+}
+
+/// On a bus that cannot keep up the others have no less while a device is busy, and it is asked nearly as often as
+/// before.
+#[test]
+fn a_device_that_is_busy_takes_no_turns_from_others() {
+    let unit = |fast, fast_reads| Unit {
+        fast,
+        slow: fast,
+        cost: 30,
+        rest: 0,
+        fast_reads,
+        slow_reads: 0,
+        once_reads: 0,
+    };
+    let units = vec![unit(4_000, 8), unit(50, 2)];
+    let case = Case { is_network: true, closes: false, units, troubles: Vec::new() };
+    let mut line = Plain::new(&case.configuration(), vec![30; 2]);
+    line.run_for(SETTLES).expect("no fault");
+    line.asked.clear();
+    let turns_in = |line: &mut Plain, millis: u64| {
+        line.run_for(millis).expect("no fault");
+        let of_other = line.asked.iter().filter(|asked| asked.unit == 2).count();
+        let all = std::mem::take(&mut line.asked).len();
+        [all - of_other, of_other]
+    };
+    for code in [5, 6] {
+        let [turns, usual] = turns_in(&mut line, 10_000);
+        line.refuses = Some((0, code));
+        let [asked, meanwhile] = turns_in(&mut line, 10_000);
+        assert!(meanwhile >= usual * 99 / 100, "exception {code}: {meanwhile} turns instead of {usual}");
+        assert!(asked * 3 >= turns * 2, "exception {code}: {asked} times instead of {turns}");
+        line.refuses = None;
+        line.run_for(FORGOTTEN).expect("no fault");
+        line.asked.clear();
+    }
 }
 
 /// So many times what it would be if everybody had their share at each moment a read may wait: others may be two periods
@@ -464,10 +506,7 @@ impl Case {
             Trouble::Slow(_) => self.look_for_starving(times, span, None, |of| of.cost() * SLOWER as f64),
             Trouble::Nothing => self.look_for_starving(times, span, None, Unit::cost),
             Trouble::Leaves(_) | Trouble::Refuses(..) => {
-                // What is busy is asked again soon, before all others.
-                let is_busy = matches!(trouble, Trouble::Refuses(_, 5 | 6));
-                let of_others = if is_busy { AHEAD * unit.cost() } else { 0.0 };
-                self.look_for_starving(times, span, Some(number_of(befallen)), |of| of.cost() + of_others)
+                self.look_for_starving(times, span, Some(number_of(befallen)), Unit::cost)
             }
             Trouble::Collisions(_) => self.look_for_starving(times, span, None, |of| of.cost() + COLLISION),
             // Others have to wait for its silence, and it is asked as seldom as it pleases.
@@ -517,15 +556,22 @@ impl Case {
         for (read, period) in self.periods() {
             let Some(asked) = times.get(&read).filter(|asked| asked.len() > ROUNDS) else { continue };
             let found = (asked[asked.len() - 1] - asked[0]).as_secs_f64() / (asked.len() - 1) as f64;
-            let unit = &self.units[usize::from(read.0) - 1];
-            // It cannot be asked twice in a row where there are others, and decides itself how much slower that makes it.
-            let is_often_asked = unit.reads_a_second() * (unit.rest() + unit.cost()) > 0.5;
-            let has_to_rest = unit.rest > 0 && (is_often_asked || self.load(Unit::cost) > KEEPS_UP);
-            if !has_to_rest {
-                stretches.push(found / period);
-            }
+            stretches.push((read.0, found / period));
         }
-        stretches
+        let least = stretches.iter().map(|(_, stretch)| *stretch).fold(f64::MAX, f64::min);
+        let can_be_had = |unit: u8| self.slower_for_its_silence(unit) < least * NEARLY;
+        stretches.iter().filter(|(unit, _)| can_be_had(*unit)).map(|(_, stretch)| *stretch).collect()
+    }
+
+    /// By how much a unit's periods are longer at least. Nobody waits for the end of its silence: behind that it
+    /// waits in turn for what another one was asked meanwhile.
+    fn slower_for_its_silence(&self, number: u8) -> f64 {
+        let index = usize::from(number) - 1;
+        let unit = &self.units[index];
+        let others = self.units.iter().enumerate().filter(|(other, _)| *other != index);
+        let begun = others.map(|(_, other)| other.cost()).fold(0.0, f64::max);
+        let of_request = if unit.rest > 0 { unit.cost() + unit.rest() + begun } else { 0.0 };
+        unit.reads_a_second() * of_request
     }
 
     /// Where the bus keeps up so does each read; where it does not all are slower by the same factor.
@@ -572,6 +618,8 @@ const AHEAD: f64 = 8.0;
 const SLOWER: u64 = 5;
 /// What a request that meets another takes until it is asked again.
 const COLLISION: f64 = 0.6;
+/// So much of what a unit with a silence of its own can have it does have.
+const NEARLY: f64 = 0.95;
 /// A bus keeps up at less, and does not at more.
 const KEEPS_UP: f64 = 0.7;
 const OVERLOADED: f64 = 1.1;

@@ -56,7 +56,7 @@ pub const ROWS: &[Row] = &[
     Row {
         number: 20,
         fault: "The exceptions \"acknowledge\" and \"busy\" are shown as 0",
-        done: "A unit answers 6 to five reads and 5 to five more; another answers 4 for good",
+        done: "A unit answers 6 to three reads and 5 to three more; another answers 4 for good",
         seen: "Asks the busy one again until it has the value; of the other its points say `None`, never 0",
         run: busy,
     },
@@ -277,8 +277,8 @@ fn busy() {
         }
         count += 1;
         vec![Step::Say(match count {
-            1..=5 => exception(asked, Framing::Rtu, 6),
-            6..=10 => exception(asked, Framing::Rtu, 5),
+            1..=3 => exception(asked, Framing::Rtu, 6),
+            4..=6 => exception(asked, Framing::Rtu, 5),
             _ => good,
         })]
     });

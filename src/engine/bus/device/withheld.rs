@@ -15,11 +15,12 @@ use super::{Context, DeviceState, Severity, Span};
 
 /// A read that the device answers with an exception is asked again after this.
 const PAUSE_EXCEPTION: Duration = Duration::from_secs(60);
-/// After "busy" (exceptions 5 and 6) the device is asked again after this.
+/// For what a device is too busy (exceptions 5 and 6) it is asked again after this, and then after as long as it has
+/// been busy with it, up to [`PAUSE_BUSY_LONG`].
 const PAUSE_BUSY: Duration = Duration::from_millis(200);
+pub(super) const PAUSE_BUSY_LONG: Duration = Duration::from_secs(2);
 /// One that is busy for so long is not done soon.
 const BUSY_LONG: Duration = Duration::from_secs(10);
-pub(super) const PAUSE_BUSY_LONG: Duration = Duration::from_secs(2);
 /// One that was given before and is refused now may be wanted of a device that is still starting, or of a gateway that
 /// has lost it: only what is refused for so long is believed to be refused for good.
 const REFUSED_LONG: Duration = Duration::from_secs(10);
@@ -152,12 +153,15 @@ impl DeviceState {
             let was_answered = self.polls.has_been_answered(index);
             let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
             withheld.refused_since = None;
-            if now - withheld.since >= BUSY_LONG {
-                self.withhold(now, index, PAUSE_BUSY_LONG, &Missing::Exception(code), context);
+            let busy_for = now - withheld.since;
+            let pause = busy_for.clamp(PAUSE_BUSY, PAUSE_BUSY_LONG);
+            if busy_for >= BUSY_LONG {
+                self.withhold(now, index, pause, &Missing::Exception(code), context);
             } else {
-                self.polls.pause(index, now + PAUSE_BUSY);
+                self.polls.pause(index, now + pause);
             }
-            self.polls.want_again(index);
+            // Nobody else has to wait because this one is busy.
+            self.polls.try_again(index, now, false);
             return;
         }
         let suspects = if code == 2 { read.refused() } else { Vec::new() };
