@@ -1,6 +1,8 @@
 //! What a bus does with its wire, on simulated time: as `busker check` forecasts it, and with plans that
 //! follow the devices.
 
+mod commands;
+mod dying;
 mod feeding;
 mod forecast;
 mod network;
