@@ -1,6 +1,8 @@
 //! What a bus does with its wire, on simulated time: as `busker check` forecasts it for lines, networks and watchdogs,
 //! also of random configurations; with plans that follow the devices; and with fair turns for all, whatever befalls it.
 
+mod commands;
+mod dying;
 mod feeding;
 mod forecast;
 mod network;

@@ -1,7 +1,7 @@
 //! A bus, its guard and a wire that charges what a line charges, on simulated time: units that hold zeros. The wire's
 //! arithmetic is the specification's, and not the program's own. A network charges the devices' turnaround alone.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 use busker::engine::bus::{Action, Bus, Command, Event};
 use busker::engine::device::Identify;
@@ -28,6 +28,9 @@ pub struct Asked {
 /// What stands before the unit on Modbus TCP: the transaction, the protocol, the length.
 const MBAP: usize = 6;
 
+/// So many bytes: less than comes in a tenth of a second, in which a frame would be taken to be over.
+const HANDED_OVER: usize = 32;
+
 pub struct Wire {
     pub now: Time,
     pub bus: Bus,
@@ -43,7 +46,8 @@ pub struct Wire {
     /// Units that do not answer.
     dead: Vec<u8>,
     to_send: Option<Time>,
-    answer: Option<(Time, Vec<u8>)>,
+    /// What is still to come of it, and when.
+    answer: VecDeque<(Time, Vec<u8>)>,
     reopen_at: Option<Time>,
     registers: BTreeMap<(u8, u16), u16>,
     /// Registers that answer with this exception whatever read they are in.
@@ -65,7 +69,7 @@ impl Wire {
             turnaround,
             dead: Vec::new(),
             to_send: None,
-            answer: None,
+            answer: VecDeque::new(),
             reopen_at: None,
             registers: BTreeMap::new(),
             refusing: BTreeMap::new(),
@@ -109,7 +113,7 @@ impl Wire {
     pub fn run_until(&mut self, end: Time) {
         loop {
             let send = self.to_send.map(|not_before| not_before.max(self.guard.earliest_send(self.now)));
-            let answer = self.answer.as_ref().map(|(at, _)| *at);
+            let answer = self.answer.front().map(|(at, _)| *at);
             let times = [self.reopen_at, send.or(self.guard.wake_at()), answer, self.bus.wake_at()];
             let next = times.into_iter().flatten().min().expect("something is to come").max(self.now);
             if next > end {
@@ -127,8 +131,9 @@ impl Wire {
             self.reopen_at = None;
             self.tell(Event::LinkUp);
         }
-        if self.answer.as_ref().is_some_and(|(at, _)| *at <= now) {
-            let (_, bytes) = self.answer.take().expect("it was there");
+        let is_heard = self.answer.front().is_some_and(|(at, _)| *at <= now);
+        let heard = if is_heard { self.answer.pop_front() } else { None };
+        if let Some((_, bytes)) = heard {
             let reply = self.guard.received(now, &bytes);
             self.replied(reply);
         }
@@ -187,14 +192,19 @@ impl Wire {
             43 => answer.extend(self.names(unit)),
             _ => answer = vec![unit, function | 0x80, 1],
         }
-        let mut took = self.turnaround;
+        let begins = self.now + self.turnaround;
         if is_line {
             answer.extend(crc(&answer).to_le_bytes());
-            took += self.characters(frame.len() + answer.len());
+            // As an adapter hands them over that waits until it has a few.
+            let mut said = frame.len();
+            for bytes in answer.chunks(HANDED_OVER) {
+                said += bytes.len();
+                self.answer.push_back((begins + self.characters(said), bytes.to_vec()));
+            }
         } else {
             answer.splice(..0, [whole[0], whole[1], 0, 0, 0, answer.len() as u8]);
+            self.answer.push_back((begins, answer));
         }
-        self.answer = Some((self.now + took, answer));
     }
 
     /// The answer to function 43/14: the names that the unit's profile wants to hear.

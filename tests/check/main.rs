@@ -194,7 +194,7 @@ fn watchdogs_and_heartbeats_that_will_not_be_fed_in_time_are_named_with_what_to_
     let told = text(&check(&with("900ms", "100ms"), &[]).stdout);
     for part in [
         "relays: watchdog `watchdog` of 900 ms may run out while another device is silent",
-        "set `watchdog` to 2s or longer, or `response_timeout` of the bus to 260ms",
+        "set `watchdog` to 1.6s or longer, or `response_timeout` of the bus to 280ms",
         "dampers: heartbeat `channel_1_receive_time` of 100 ms will run out",
         "dampers: watchdog `watchdog` is as the device has it",
     ] {

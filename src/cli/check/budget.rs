@@ -30,6 +30,8 @@ pub struct Budget {
     /// How long a request to a device that is silent keeps the bus: the wait for its answer, and on a
     /// serial line as long again for a late one.
     pub one_silent: f64,
+    /// The longest time that an answer is waited for.
+    pub timeout: f64,
 }
 
 impl Budget {
@@ -64,7 +66,7 @@ impl Budget {
                 line.characters(8) + longest_timeout * 2 + bus.gap.unwrap_or_else(|| line.frame_gap())
             }
         };
-        Budget { reads, wants, one_silent: one_silent.as_secs_f64() }
+        Budget { reads, wants, one_silent: one_silent.as_secs_f64(), timeout: longest_timeout.as_secs_f64() }
     }
 
     /// Seconds of wire that the polls want in a second.
@@ -84,7 +86,12 @@ impl Budget {
 
     /// The longest request that may be on the wire when something comes.
     pub fn longest(&self) -> f64 {
-        self.reads.iter().map(|read| read.time + read.rest).fold(0.0, f64::max)
+        longest(self.reads.iter())
+    }
+
+    /// The longest to this device.
+    pub fn longest_of(&self, device: usize) -> f64 {
+        longest(self.reads.iter().filter(|read| read.device == device))
     }
 
     /// How many requests a device has to answer again and again: its reads, and a heartbeat.
@@ -97,6 +104,10 @@ impl Budget {
     pub fn round(&self) -> f64 {
         self.reads.iter().filter(|read| read.period.is_some()).map(|read| read.time + read.rest).sum()
     }
+}
+
+fn longest<'a>(reads: impl Iterator<Item = &'a Planned>) -> f64 {
+    reads.map(|read| read.time + read.rest).fold(0.0, f64::max)
 }
 
 impl Planned {

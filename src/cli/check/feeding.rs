@@ -1,19 +1,19 @@
 //! Whether the watchdogs and heartbeats of devices are fed in time, also while another device is silent.
 //!
-//! A watchdog is fed by any request to its device: by its most frequent poll, and where that is too seldom
-//! by a read that the program makes when a third of the watchdog's time has passed. Where the configuration
-//! does not say what that time is, only the polls are counted. What may come between: a read of everything
-//! else that is due at the same moment; other watchdogs and heartbeats; and of a device that has just fallen
-//! silent the wait for its answer, as long again in which the line is left alone, and a round of everything
-//! else that has become due meanwhile. Before a poll that may be once for each read of the silent device, since all
-//! of them may be due for longer. Commands are not counted: they put a feeding off until two thirds of the
-//! time have passed, and no further.
+//! A watchdog is fed by any request to its device. When a third of its time has passed the program makes one that goes
+//! before everything else: then only that may come between which is on the wire, and other watchdogs and heartbeats,
+//! with a read behind each eight of them. By that alone it is judged whether the time is met. Of a device that has just
+//! fallen silent it is the wait for its answer that is on the wire, and as long again in which a line is left alone.
+//! Commands are not counted: they put a feeding off until two thirds of the time have passed, and no further.
+//!
+//! Most watchdogs are fed sooner by the polls, and then that is told: the longest wait that the rehearsal has seen, and
+//! a request more; with a silence for each read of the device that falls silent, since all of them may be due before.
 
 use serde::Serialize;
 
 use super::budget::Budget;
 use super::{advice, told};
-use crate::engine::bus::FAILURES_UNTIL_OFFLINE;
+use crate::engine::bus::{AHEAD_OF_READS, FAILURES_UNTIL_OFFLINE};
 use crate::engine::codec;
 use crate::engine::device::{Point, PointIndex};
 use crate::engine::plan::Cost;
@@ -27,96 +27,83 @@ const HEARTBEATS_WITHIN: f64 = 3.0;
 /// What must fit into the rest of a time of which a third has passed fits into one so many times as long.
 const LONGER: f64 = HEARTBEATS_WITHIN / (HEARTBEATS_WITHIN - 1.0);
 
+/// A device that has not answered is left alone for so long at least; on a line no longer than the line itself.
+const LEFT_ALONE: f64 = 0.125;
+/// A bus that cannot keep up gives the turns less evenly behind a silence: of sixty such buses with units that die, the
+/// one with the longest wait made it 1.25 times as long.
+const UNEVEN: f64 = 1.5;
+
 /// What the bus does to a device's patience, in seconds.
 #[derive(Clone, Copy)]
 pub struct Delays {
-    asked: Asked,
-    /// The request that is on the wire when something comes; and all that is read again and again, once.
+    /// The longest time from one request to the next that its polls leave, and the same behind a silence; none where
+    /// nothing is polled.
+    polled_every: Option<[f64; 2]>,
+    /// The request that is on the wire when something comes.
     one_request: f64,
-    round: f64,
-    /// What other watchdogs and heartbeats may send first, if all are due at once.
+    /// A request that nobody answers, and on a line the silence after it.
+    one_silent: f64,
+    /// What other watchdogs and heartbeats may send first, if all are due at once; and how many reads go between.
     others_fed: f64,
+    reads_between: f64,
     /// And this device's own heartbeats.
     own_beats: f64,
-    /// A request that nobody answers, the silence after it, and what is left of the silence after the one
-    /// before it.
-    one_silent: f64,
-    /// The same for all that may be asked of such a device before a poll of this one.
-    all_silent: f64,
-    /// The response timeout, and whether a line is left alone for as long again.
+    /// The response timeout, and so many times it is waited for: twice on a line.
     timeout: f64,
-    is_line: bool,
-}
-
-/// How often a device is asked by its polls, in seconds.
-#[derive(Clone, Copy)]
-pub struct Asked {
-    /// The longest time between two requests; none where nothing is polled.
-    pub every: Option<f64>,
-    /// The longest that was seen to pass between two, where the bus cannot keep up: there a round of everything else
-    /// between two polls is not the most.
-    pub waited_for: f64,
+    timeouts: f64,
 }
 
 impl Delays {
     /// `device` is its number on the bus.
-    pub fn of(bus: &Bus, settings: &DeviceSettings, device: usize, asked: Asked, budget: &Budget) -> Delays {
-        let others = budget.wants.iter().enumerate().filter(|(other, _)| *other != device);
-        let fed = |wants: &Wants| wants.fed_every.map_or(0.0, |_| budget.longest()) + wants.time_of_beats();
-        let demanded = settings.device.wire.response_timeout.unwrap_or_default();
-        let timeout = bus.response_timeout.max(demanded).as_secs_f64();
+    pub fn of(bus: &Bus, device: usize, asked_every: Option<f64>, load: f64, budget: &Budget) -> Delays {
+        let others = || budget.wants.iter().enumerate().filter(move |(other, _)| *other != device);
+        let fed = |(other, wants): (usize, &Wants)| {
+            wants.fed_every.map_or(0.0, |_| budget.longest_of(other)) + wants.time_of_beats()
+        };
+        let requests = |wants: &Wants| usize::from(wants.fed_every.is_some()) + 2 * wants.beats.len();
+        let requests: usize = others().map(|(_, wants)| requests(wants)).sum();
         let is_line = bus.link.line().is_some();
-        let one_silent = (budget.one_silent + repeated(timeout, is_line)).max(budget.longest());
-        let reads = (0..budget.wants.len()).filter(|other| *other != device);
-        let reads = reads.map(|other| budget.asked_again_and_again(other)).max().unwrap_or_default();
-        let all_silent = all_silent(budget, reads, timeout, is_line).max(one_silent);
+        let reads = others().map(|(other, _)| budget.asked_again_and_again(other)).max().unwrap_or_default();
+        // Not where the others find the time between two of them.
+        let alone = !is_line && budget.longest() + budget.round() <= LEFT_ALONE;
+        let most = if alone { 1.0 } else { f64::from(FAILURES_UNTIL_OFFLINE) };
+        let in_vain = (reads as f64).clamp(1.0, most);
+        let one_silent = budget.one_silent.max(budget.longest());
+        // A poll is put off for up to half as long again, at random.
+        let random = if is_line { budget.timeout / 2.0 } else { 0.0 };
+        let uneven = if load > 1.0 { UNEVEN } else { 1.0 };
+        let polled_every = |every: f64| {
+            let behind_silence = every * uneven + in_vain * (one_silent + random);
+            [every, behind_silence].map(|every| every + budget.longest())
+        };
         Delays {
-            asked,
+            polled_every: asked_every.map(polled_every),
             one_request: budget.longest(),
-            round: budget.round(),
-            others_fed: others.map(|(_, wants)| fed(wants)).sum(),
-            own_beats: budget.wants[device].time_of_beats(),
             one_silent,
-            all_silent,
-            timeout,
-            is_line,
+            others_fed: others().map(fed).sum(),
+            reads_between: (requests / AHEAD_OF_READS as usize) as f64,
+            own_beats: budget.wants[device].time_of_beats(),
+            timeout: budget.timeout,
+            timeouts: if is_line { 2.0 } else { 1.0 },
         }
+    }
+
+    /// What may come before that which goes before everything else: while all devices answer, and where one is silent.
+    fn before(&self) -> [f64; 2] {
+        let rest = self.others_fed + self.reads_between * self.one_request;
+        [self.one_request, self.silences() * self.one_silent].map(|first| first + rest)
+    }
+
+    /// So often a device that falls silent may be asked meanwhile.
+    fn silences(&self) -> f64 {
+        (1.0 + self.reads_between).min(f64::from(FAILURES_UNTIL_OFFLINE))
     }
 
     /// The response timeout with which the rest is over in `time`, if there is a sensible one.
     fn timeout_for(&self, time: f64, every_one_silent: f64) -> Option<Duration> {
-        let silent = |timeout: f64| timeout * 2.0 + repeated(timeout, true);
-        let wanted = if self.is_line {
-            // As much less silence as it takes, with the repeat or already without one.
-            let left = silent(self.timeout) - (every_one_silent - time);
-            if left > silent(REPEATED_AFTER) { (left + REPEATED_AFTER) / 3.0 } else { left / 2.0 }
-        } else {
-            self.timeout - (every_one_silent - time)
-        };
+        let wanted = self.timeout - (every_one_silent - time) / (self.timeouts * self.silences());
         (wanted >= SHORTEST_TIMEOUT).then(|| advice::round_down(Duration::from_secs_f64(wanted)))
     }
-}
-
-/// A device that has not answered is asked again so soon at the earliest.
-const REPEATED_AFTER: f64 = 0.24;
-
-/// On a serial line its next request may be decided while the line is still left alone after the last one,
-/// and wait for the rest of that; what is due meanwhile comes after it.
-fn repeated(timeout: f64, is_line: bool) -> f64 {
-    if is_line { (timeout - REPEATED_AFTER).max(0.0) } else { 0.0 }
-}
-
-/// What a device that has just fallen silent keeps the bus before a poll of another one: each of its `reads` may
-/// have been due for longer, and be asked in vain until the device counts as offline. Not where the others find the
-/// time between two of them.
-fn all_silent(budget: &Budget, reads: usize, timeout: f64, is_line: bool) -> f64 {
-    let left_alone = if is_line { timeout } else { 0.0 };
-    let most = f64::from(FAILURES_UNTIL_OFFLINE);
-    let asked = match budget.longest() + budget.round() <= REPEATED_AFTER - left_alone {
-        true => 1.0,
-        false => (reads as f64).clamp(1.0, most),
-    };
-    (asked * budget.one_silent + repeated(timeout, is_line)).min(most * budget.one_silent)
 }
 
 /// A response timeout that no device should be offered less than.
@@ -147,32 +134,30 @@ pub fn of_device(settings: &DeviceSettings, delays: Delays) -> Vec<Feeding> {
     let mut all = Vec::new();
     if let Some(point) = device.wire.watchdog {
         let time = declared_seconds(settings, point);
-        // After a third of a time that is known it is fed before anything else is polled.
-        let due = time.filter(|time| *time > 0.0).map_or(f64::INFINITY, |time| time / HEARTBEATS_WITHIN);
-        // Otherwise one may be on the wire and everything else be due when it is due, and the device that
-        // is silent among that.
-        let Asked { every, waited_for } = delays.asked;
-        let every = every.unwrap_or(f64::INFINITY);
-        let polled_every = (every + delays.round).max(waited_for) + delays.one_request;
-        // Behind a silence there may be such a round as well.
-        let uneven = every.max(waited_for) + delays.round + delays.one_request;
-        let polled_every_one_silent = uneven + delays.all_silent;
-        let [before, before_one_silent] =
-            [delays.one_request, delays.one_silent].map(|delay| delay + delays.others_fed);
-        let every = [polled_every.min(due + before), polled_every_one_silent.min(due + before_one_silent)];
-        let enough = polled_every_one_silent.min(before_one_silent * LONGER);
-        // Nothing can be said where nothing is polled again and again and its time is not known.
-        if every[0].is_finite() {
-            all.push(Feeding::new(settings, point, "watchdog", time, every, enough, delays));
+        let before = delays.before();
+        let every = match (time.filter(|time| *time > 0.0), delays.polled_every) {
+            // After a third of a time that is known it is fed before anything else is polled. How often it is polled
+            // does not count where that is too late.
+            (Some(time), polled) => {
+                let fed = before.map(|before| time / HEARTBEATS_WITHIN + before);
+                let [polled, polled_one_silent] = polled.unwrap_or(fed);
+                let sooner = |fed: f64, polled: f64| if fed < time { fed.min(polled) } else { fed };
+                Some([sooner(fed[0], polled), sooner(fed[1], polled_one_silent)])
+            }
+            // Nothing can be said where nothing is polled again and again and its time is not known.
+            (None, polled) => polled,
+        };
+        if let Some(every) = every {
+            all.push(Feeding::new(settings, point, "watchdog", time, every, before[1] * LONGER, delays));
         }
     }
     for point in times_of_heartbeats(settings) {
         let time = declared_seconds(settings, point);
         // What is read and written is two requests, and what may go before each of them.
         let due = time.unwrap_or_default() / HEARTBEATS_WITHIN;
-        let before = 3.0 * delays.one_request + delays.others_fed + delays.own_beats;
-        let every = [delays.one_request, delays.one_silent].map(|delay| due + delay + before);
-        let enough = (delays.one_silent + before) * LONGER;
+        let own = 3.0 * delays.one_request + delays.own_beats;
+        let every = delays.before().map(|before| due + before + own);
+        let enough = (delays.before()[1] + own) * LONGER;
         all.push(Feeding::new(settings, point, "heartbeat", time, every, enough, delays));
     }
     all

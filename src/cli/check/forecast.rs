@@ -58,10 +58,9 @@ impl Forecast {
         self.periods.get(&(device, poll)).copied().unwrap_or(wanted * self.load.max(1.0))
     }
 
-    /// The longest time from one request to this unit to the next, as far as it was seen, where the bus cannot keep
-    /// up: how unevenly a read has its turns there no sum tells.
-    pub fn waits_unevenly(&self, unit: u8) -> f64 {
-        if self.load > 1.0 { self.waits.get(&unit).copied().unwrap_or_default() } else { 0.0 }
+    /// The longest time from one request to this unit to the next, as far as it was seen.
+    pub fn longest_wait(&self, unit: u8) -> f64 {
+        self.waits.get(&unit).copied().unwrap_or_default()
     }
 }
 

@@ -22,7 +22,7 @@ use crate::engine::settings::{DeviceSettings, Settings};
 use crate::engine::time::Duration;
 use crate::engine::yaml::{Diagnostic, Scalar};
 use budget::Budget;
-use feeding::{Asked, Delays, Feeding};
+use feeding::{Delays, Feeding};
 use forecast::Forecast;
 
 /// Check the configuration and the profiles that it uses
@@ -267,9 +267,8 @@ impl BusSummary {
                 poll.seconds += read.time;
             }
             let periods = polls.values().filter_map(|poll| poll.real_period);
-            let asked =
-                Asked { every: periods.reduce(f64::min), waited_for: forecast.waits_unevenly(settings.unit) };
-            let delays = Delays::of(bus, settings, number, asked, &budget);
+            let every = periods.reduce(f64::min).map(|every| every.max(forecast.longest_wait(settings.unit)));
+            let delays = Delays::of(bus, number, every, load, &budget);
             DeviceSummary {
                 name: settings.name.clone(),
                 title: settings.title.clone(),

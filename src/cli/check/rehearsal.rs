@@ -4,7 +4,7 @@
 //! Nothing here decides anything. Whatever the program does with this configuration it does here too, as long as
 //! its devices hold what they are thought to hold: what `settings` want, and else what the factory set.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 use crate::engine::bus::{Action, Bus, Event};
 use crate::engine::device::{Device, PointIndex};
@@ -34,6 +34,9 @@ pub struct Rehearsal<'a> {
     busy_until: Time,
 }
 
+/// An answer comes in pieces that take no longer: of a long one the end may come after the response timeout.
+const PIECE: Duration = Duration::from_millis(50);
+
 /// What is under way.
 #[derive(Default)]
 struct Link {
@@ -44,7 +47,8 @@ struct Link {
     not_before: Time,
     decided_at: Time,
     sent_at: Time,
-    answer: Option<(Time, Vec<u8>)>,
+    /// What comes of the answer, piece by piece.
+    answer: VecDeque<(Time, Vec<u8>)>,
 }
 
 /// A request on the wire.
@@ -104,7 +108,7 @@ impl<'a> Rehearsal<'a> {
     fn next_time(&self) -> Time {
         let link = &self.link;
         let send = link.to_send.as_ref().map(|_| link.not_before.max(self.guard.earliest_send(self.now)));
-        let answer = link.answer.as_ref().map(|(at, _)| *at);
+        let answer = link.answer.front().map(|(at, _)| *at);
         let times = [link.opens_at, send.or(self.guard.wake_at()), answer, self.bus.wake_at()];
         times.into_iter().flatten().min().unwrap_or(Time(u64::MAX))
     }
@@ -116,7 +120,9 @@ impl<'a> Rehearsal<'a> {
             self.link.opens_at = None;
             self.tell(Event::LinkUp);
         }
-        if let Some((_, bytes)) = self.link.answer.take_if(|(at, _)| *at <= now) {
+        let is_heard = self.link.answer.front().is_some_and(|(at, _)| *at <= now);
+        let heard = if is_heard { self.link.answer.pop_front() } else { None };
+        if let Some((_, bytes)) = heard {
             let reply = self.guard.received(now, &bytes);
             self.replied(reply);
         }
@@ -153,11 +159,15 @@ impl<'a> Rehearsal<'a> {
         let Some(pdu) = player.answer(self.now, pdu) else { return };
         let asked = frame.len();
         let answer = Frame { transaction, unit, pdu }.encode(framing);
-        let on_wire = self.settings.buses[self.index]
-            .link
-            .line()
-            .map_or(Duration::ZERO, |line| line.characters((asked + answer.len()) as u32));
-        self.link.answer = Some((self.now + on_wire + self.turnaround, answer));
+        let line = self.settings.buses[self.index].link.line();
+        let on_wire = |bytes: usize| line.map_or(Duration::ZERO, |line| line.characters(bytes as u32));
+        let begins = self.now + self.turnaround;
+        let most = (PIECE.as_micros() / on_wire(1).as_micros().max(1)).max(1) as usize;
+        let mut on_its_way = asked;
+        for piece in answer.chunks(most) {
+            on_its_way += piece.len();
+            self.link.answer.push_back((begins + on_wire(on_its_way), piece.to_vec()));
+        }
     }
 
     fn replied(&mut self, reply: Option<Reply>) {

@@ -59,6 +59,7 @@ use recording::Recorder;
 pub use recording::Saved;
 use requests::Requests;
 use timekeeping::Timekeeping;
+pub use turns::AHEAD_OF_READS;
 use waiting::{Target, WaitingCommands};
 
 /// What can happen to a bus.

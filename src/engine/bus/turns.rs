@@ -17,7 +17,7 @@ use super::{Action, Bus, GivesWay, InFlight, LinkState, OnBrokerLoss, Purpose};
 
 /// So many requests in a row may go before a read that is due, because somebody wants them at once. Then
 /// the read has its turn: under a flood of commands every period stretches, but nothing starves.
-const AHEAD_OF_READS: u32 = 8;
+pub const AHEAD_OF_READS: u32 = 8;
 
 /// So many heartbeats and feedings in a row may go before whatever else somebody wants. More are never needed but
 /// where a device allows less time than the line can keep. There they may not keep from the wire what ends it: the
