@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use super::budget::Budget;
 use super::{advice, told};
-use crate::engine::bus::{AHEAD_OF_READS, FAILURES_UNTIL_OFFLINE};
+use crate::engine::bus::{AHEAD_OF_READS, FAILURES_UNTIL_OFFLINE, LEFT_ALONE_LEAST};
 use crate::engine::codec;
 use crate::engine::device::{Point, PointIndex};
 use crate::engine::plan::Cost;
@@ -27,8 +27,6 @@ const HEARTBEATS_WITHIN: f64 = 3.0;
 /// What must fit into the rest of a time of which a third has passed fits into one so many times as long.
 const LONGER: f64 = HEARTBEATS_WITHIN / (HEARTBEATS_WITHIN - 1.0);
 
-/// A device that has not answered is left alone for so long at least; on a line no longer than the line itself.
-const LEFT_ALONE: f64 = 0.125;
 /// A bus that cannot keep up gives the turns less evenly behind a silence: of sixty such buses with units that die, the
 /// one with the longest wait made it 1.25 times as long.
 const UNEVEN: f64 = 1.5;
@@ -64,9 +62,9 @@ impl Delays {
         let requests: usize = others().map(|(_, wants)| requests(wants)).sum();
         let is_line = bus.link.line().is_some();
         let reads = others().map(|(other, _)| budget.asked_again_and_again(other)).max().unwrap_or_default();
-        // Not where the others find the time between two of them.
-        let alone = !is_line && budget.longest() + budget.round() <= LEFT_ALONE;
-        let most = if alone { 1.0 } else { f64::from(FAILURES_UNTIL_OFFLINE) };
+        // Not where the others find the time between two of them; a line is left alone for as long as the device.
+        let others_between = !is_line && budget.longest() + budget.round() <= LEFT_ALONE_LEAST.as_secs_f64();
+        let most = if others_between { 1.0 } else { f64::from(FAILURES_UNTIL_OFFLINE) };
         let in_vain = (reads as f64).clamp(1.0, most);
         let one_silent = budget.one_silent.max(budget.longest());
         // A poll is put off for up to half as long again, at random.

@@ -5,6 +5,8 @@ use crate::engine::time::{Duration, Time};
 
 /// So many requests in a row without an answer, and a device counts as offline.
 pub const FAILURES_UNTIL_OFFLINE: u32 = 3;
+/// A device that has not answered is left alone for so long at least: half of the first pause, which is random.
+pub const LEFT_ALONE_LEAST: Duration = Duration::from_millis(125);
 /// The longest pause between two attempts: with the attempt itself, what a device's return may take to
 /// be noticed is 15 seconds.
 const PAUSE_LONGEST: Duration = Duration::from_millis(14_200);
@@ -166,7 +168,7 @@ impl Patience {
     pub(super) fn pause(&self, now: Time, full: Duration, demanded: Option<Duration>) -> Duration {
         let short = self.short_probe(full, demanded);
         let usual = if self.slowest_answer.is_some() { short } else { (short + full) / 2 };
-        let backoff = Duration::from_millis(125 << self.failures.min(8));
+        let backoff = LEFT_ALONE_LEAST * (1 << self.failures.min(8));
         let pause = backoff.min(Patience::pause_after(usual + FRAME));
         let spread = match self.is_probing() {
             false => pause * SPREAD_PRESENT_PERCENT / 100,
