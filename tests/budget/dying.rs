@@ -5,11 +5,8 @@ use std::fmt::Write;
 
 use busker::engine::time::{Duration, Time};
 
-use super::check;
 use super::wire::Wire;
-
-const BUS: &str = "buses:\n  line: {serial: /dev/serial/by-id/usb-A, baud: 19200, parity: even, response_timeout: 500ms}\ndevices:\n";
-const TURNAROUND: Duration = Duration::from_millis(5);
+use super::{LINE, TURNAROUND, check, neighbours};
 
 /// Of this device's watchdog, in seconds.
 fn fed_every_one_silent(configuration: &str, device: usize) -> f64 {
@@ -25,19 +22,16 @@ fn a_watchdog_that_only_polls_feed_waits_for_each_read_of_a_unit_that_dies() {
             .map(|number| format!("p{number}: {{at: holding {}, type: u16, poll: fast}}", 1000 * number))
             .collect();
         let mut configuration = format!(
-            "{BUS}  relays: {{bus: line, unit: 1, profile: metz-connect/mr-do4, poll: {{fast: 600ms, slow: 60s}}}}\n  \
+            "{LINE}  relays: {{bus: line, unit: 1, profile: metz-connect/mr-do4, poll: {{fast: 600ms, slow: 60s}}}}\n  \
              meter: {{bus: line, unit: 2, poll: {{fast: 10s}}, points: {{{}}}}}\n",
             points.join(", ")
         );
         // These are asked while the meter alone is left alone.
-        let held: Vec<String> = (0..40)
-            .map(|number| format!("p{number}: {{at: holding {number}, type: u16, poll: fast}}"))
-            .collect();
+        let held = neighbours(40);
         for unit in 3..=6 {
             let _ = writeln!(
                 configuration,
-                "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: 290ms}}, points: {{{}}}}}",
-                held.join(", ")
+                "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: 290ms}}, points: {{{held}}}}}"
             );
         }
         let forecast = fed_every_one_silent(&configuration, 0);
@@ -69,7 +63,7 @@ fn a_watchdog_that_only_polls_feed_waits_for_each_read_of_a_unit_that_dies() {
 #[test]
 fn many_watchdogs_are_fed_as_soon_as_is_forecast_when_a_unit_dies() {
     const WATCHDOGS: u8 = 24;
-    let mut configuration = BUS.to_string();
+    let mut configuration = LINE.to_string();
     for unit in 1..=WATCHDOGS {
         let _ = writeln!(
             configuration,
@@ -77,13 +71,10 @@ fn many_watchdogs_are_fed_as_soon_as_is_forecast_when_a_unit_dies() {
              settings: {{watchdog: 4s}}}}"
         );
     }
-    let points: Vec<String> = (0..100)
-        .map(|number| format!("p{number}: {{at: holding {number}, type: u16, poll: fast}}"))
-        .collect();
+    let points = neighbours(100);
     let _ = writeln!(
         configuration,
-        "  meter: {{bus: line, unit: 40, poll: {{fast: 700ms}}, points: {{{}}}}}",
-        points.join(", ")
+        "  meter: {{bus: line, unit: 40, poll: {{fast: 700ms}}, points: {{{points}}}}}"
     );
     let forecast = fed_every_one_silent(&configuration, 0);
     let mut wire = Wire::new(&configuration, TURNAROUND);

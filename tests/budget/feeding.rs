@@ -4,12 +4,9 @@
 use busker::engine::time::{Duration, Time};
 use serde_json::Value as Json;
 
-use super::check;
 use super::wire::Wire;
+use super::{LINE, TURNAROUND, check, neighbours};
 
-const BUS: &str =
-    "buses:\n  line: {serial: /dev/serial/by-id/usb-A, baud: 19200, parity: even, response_timeout: 500ms}\n";
-const TURNAROUND: Duration = Duration::from_millis(5);
 const WITHIN: f64 = 0.05;
 
 /// A relay module with this watchdog and these polls, and seven units that are polled `others` often.
@@ -37,16 +34,13 @@ impl Case {
     fn configuration(&self) -> String {
         let Case { watchdog, polls, others, .. } = self;
         let mut text = format!(
-            "{BUS}devices:\n  relays: {{bus: line, unit: 1, profile: metz-connect/mr-do4, poll: {{{polls}}}, \
+            "{LINE}  relays: {{bus: line, unit: 1, profile: metz-connect/mr-do4, poll: {{{polls}}}, \
              settings: {{watchdog: {watchdog}}}}}\n"
         );
-        let points: Vec<String> = (0..20)
-            .map(|number| format!("p{number}: {{at: holding {number}, poll: fast, type: u16}}"))
-            .collect();
+        let points = neighbours(20);
         for unit in 2..=8 {
             text += &format!(
-                "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: {others}}}, points: {{{}}}}}\n",
-                points.join(", ")
+                "  unit_{unit}: {{bus: line, unit: {unit}, poll: {{fast: {others}}}, points: {{{points}}}}}\n"
             );
         }
         text
@@ -124,7 +118,7 @@ fn what_heartbeats_cost_is_part_of_the_load() {
     let (mode, time, motor) = (2, 8, 1);
     let dampers = |settings: &str| {
         format!(
-            "{BUS}devices:\n  dampers: {{bus: line, unit: 1, profile: metz-connect/mr-dio42, \
+            "{LINE}  dampers: {{bus: line, unit: 1, profile: metz-connect/mr-dio42, \
              poll: {{fast: 5s, slow: 60s}}{settings}}}\n"
         )
     };

@@ -19,6 +19,7 @@ use std::process::Command;
 use busker::engine::configuration;
 use busker::engine::profile::Library;
 use busker::engine::settings::Settings;
+use busker::engine::time::Duration;
 use serde_json::Value as Json;
 
 use number::number;
@@ -33,6 +34,19 @@ fn settings(configuration: &str) -> Settings {
 /// So far from the one to the other, where each decade is as long as the next: half way from 1 to 100 lies 10.
 fn by_magnitude(part: f64, from: f64, to: f64) -> u64 {
     (from * libm::pow(to / from, part)) as u64
+}
+
+/// One line at 19200 Bd, whose devices follow; and how long they wait before they answer.
+const LINE: &str = "buses:\n  line: {serial: /dev/serial/by-id/usb-A, baud: 19200, parity: even, response_timeout: 500ms}\n\
+                    devices:\n";
+const TURNAROUND: Duration = Duration::from_millis(5);
+
+/// Points in so many registers, one beside the other: they are one read.
+fn neighbours(count: usize) -> String {
+    let points: Vec<String> = (0..count)
+        .map(|number| format!("p{number}: {{at: holding {number}, type: u16, poll: fast}}"))
+        .collect();
+    points.join(", ")
 }
 
 /// What `busker check --json` says of this configuration.
