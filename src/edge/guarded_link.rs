@@ -24,14 +24,19 @@ pub struct GuardedLink {
     not_before: Option<Time>,
     /// When what is there to be read came, if that is known to be earlier than now.
     came_at: Option<Time>,
-    /// Of a line; a thread for connections waits for many replies at a time.
-    expectation: Option<Expectation>,
+    expectation: Expectation,
 }
 
 impl GuardedLink {
     pub fn new(link: Link, guard: Guard, clock: Clock) -> GuardedLink {
-        let expectation = matches!(guard, Guard::Rtu(_)).then(Expectation::default);
-        GuardedLink { link, guard, clock, not_before: None, came_at: None, expectation }
+        GuardedLink {
+            link,
+            guard,
+            clock,
+            not_before: None,
+            came_at: None,
+            expectation: Expectation::default(),
+        }
     }
 
     /// Takes a request; it is sent now or by [`GuardedLink::advance`] when its time has come. A reply at
@@ -72,7 +77,7 @@ impl GuardedLink {
 
     /// When the reply to the request on the wire is likely to come, where that is known.
     pub fn reply_expected_at(&self) -> Option<Time> {
-        self.expectation.as_ref().filter(|_| self.not_before.is_none())?.at()
+        if self.not_before.is_some() { None } else { self.expectation.at() }
     }
 
     /// What is there to be read came by this time at the latest.
@@ -91,9 +96,7 @@ impl GuardedLink {
             tape.heard(time, &buffer[..count]);
             let reply = self.guard.received(time, &buffer[..count]);
             if reply.is_some() {
-                if let Some(expectation) = &mut self.expectation {
-                    expectation.answered(time);
-                }
+                self.expectation.answered(time);
                 return usable(reply);
             }
         }
@@ -106,9 +109,7 @@ impl GuardedLink {
                 self.not_before = None;
                 self.link.write(self.guard.frame())?;
                 self.guard.sent(now);
-                if let Some(expectation) = &mut self.expectation {
-                    expectation.asked(self.guard.frame(), now);
-                }
+                self.expectation.asked(question(&self.guard), now);
                 tape.sent(now, self.guard.frame());
                 Ok(None)
             }
@@ -147,6 +148,15 @@ impl GuardedLink {
 impl AsFd for GuardedLink {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.link.as_fd()
+    }
+}
+
+/// What is asked as often as the reply shall be expected: on a line the frame; on a network its length takes no
+/// time, and any question is as good as another.
+fn question(guard: &Guard) -> &[u8] {
+    match guard {
+        Guard::Rtu(guard) => guard.frame(),
+        Guard::Tcp(_) => &[0; 6],
     }
 }
 

@@ -13,6 +13,7 @@ pub mod bell;
 pub mod bus_runner;
 pub mod bus_thread;
 pub mod clock;
+pub mod doze;
 pub mod expectation;
 pub mod guarded_link;
 pub mod link;

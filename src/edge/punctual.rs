@@ -21,6 +21,24 @@ const SLEEP_MIN: Duration = Duration::from_micros(200);
 /// else it does.
 const RESTED_LATELY: Duration = Duration::from_secs(1);
 
+/// Whether a bus has time to spare, so that nobody would gain by being punctual.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Leisure {
+    /// When the bus last had nothing to do.
+    rested_at: Option<Time>,
+}
+
+impl Leisure {
+    /// The bus had nothing to do until `now`.
+    pub fn rested(&mut self, now: Time) {
+        self.rested_at = Some(now);
+    }
+
+    pub fn is_calm(&self, at: Time) -> bool {
+        self.rested_at.is_some_and(|rested_at| at.since(rested_at) < RESTED_LATELY)
+    }
+}
+
 /// The lags of one thread's latest wake-ups, in microseconds.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Punctual {
@@ -28,8 +46,6 @@ pub struct Punctual {
     seen: usize,
     /// Of all wake-ups so far.
     least: Option<u64>,
-    /// When the bus last had nothing to do.
-    rested_at: Option<Time>,
 }
 
 impl Punctual {
@@ -43,28 +59,23 @@ impl Punctual {
         }
     }
 
-    /// The bus had nothing to do until `now`.
-    pub fn rested(&mut self, now: Time) {
-        self.rested_at = Some(now);
-    }
-
-    /// Whether the bus has time to spare at `at`, so that nobody would gain by being punctual.
-    pub fn is_calm(&self, at: Time) -> bool {
-        self.rested_at.is_some_and(|rested_at| at.since(rested_at) < RESTED_LATELY)
-    }
-
-    /// When to end a sleep so as to be awake at `at`; the rest is to be spun. `at` itself where nobody
-    /// would gain by it.
+    /// When to end a sleep so as to be awake at `at`; the rest is to be spun.
     pub fn sleep_until(&self, at: Time) -> Time {
-        if self.is_calm(at) {
-            return at;
-        }
+        let Some(usual) = self.usual(9) else { return at };
+        at.before((usual + RESERVE).min(SPIN_MAX))
+    }
+
+    /// The same for who can do without: in half of all cases it comes too late, and spins so much less.
+    pub fn doze_until(&self, at: Time) -> Time {
+        at.before(self.usual(5).unwrap_or_default().min(SPIN_MAX))
+    }
+
+    /// What so many of ten wake-ups need at most.
+    fn usual(&self, of_ten: usize) -> Option<Duration> {
         let mut lags = self.lags;
         let known = &mut lags[..self.seen.min(REMEMBERED)];
         known.sort_unstable();
-        let Some(usual) = known.get(known.len() * 9 / 10) else { return at };
-        let reserve = (Duration::from_micros(*usual) + RESERVE).min(SPIN_MAX);
-        Time(at.0.saturating_sub(reserve.as_micros() as u64))
+        known.get(known.len() * of_ten / 10).map(|lag| Duration::from_micros(*lag))
     }
 
     /// What woke this thread at `now` from a sleep since `since` happened by then at the latest: no
@@ -105,11 +116,19 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_spun_for_a_bus_that_has_time_to_spare() {
-        let mut punctual = after(&[50; 10]);
-        punctual.rested(Time(1_000_000));
-        assert_eq!(punctual.sleep_until(Time(1_900_000)), Time(1_900_000));
-        assert_eq!(punctual.sleep_until(Time(2_000_000)), Time(1_999_930));
+    fn who_dozes_is_awake_in_half_of_all_cases() {
+        assert_eq!(Punctual::default().doze_until(Time(5000)), Time(5000));
+        assert_eq!(after(&[90, 10, 30, 20, 80]).doze_until(Time(5000)), Time(4970));
+        assert_eq!(after(&[9000; 10]).doze_until(Time(5000)), Time(4800));
+    }
+
+    #[test]
+    fn a_bus_that_rested_lately_has_time_to_spare() {
+        let mut leisure = Leisure::default();
+        assert!(!leisure.is_calm(Time(5000)));
+        leisure.rested(Time(1_000_000));
+        assert!(leisure.is_calm(Time(1_900_000)));
+        assert!(!leisure.is_calm(Time(2_000_000)));
     }
 
     #[test]

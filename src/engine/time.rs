@@ -18,6 +18,11 @@ impl Time {
     pub fn since(self, earlier: Time) -> Duration {
         Duration::from_micros(self.0.saturating_sub(earlier.0))
     }
+
+    /// So much earlier; the start where that would be before it.
+    pub fn before(self, duration: Duration) -> Time {
+        Time(self.0.saturating_sub(duration.as_micros().min(u128::from(u64::MAX)) as u64))
+    }
 }
 
 impl Add<Duration> for Time {

@@ -4,17 +4,17 @@ use super::wake_punctually;
 use crate::edge::bus_runner::BusRunner;
 use crate::edge::guarded_link::{Woken, wait};
 use crate::edge::link::Lost;
-use crate::edge::punctual::Punctual;
+use crate::edge::punctual::{Leisure, Punctual};
 use crate::engine::time::{Duration, Time};
 
 /// Runs a bus to its end.
 pub(super) fn run(mut runner: BusRunner) {
     wake_punctually();
-    let mut punctual = Punctual::default();
+    let mut rhythm = Rhythm::default();
     runner.begin();
     runner.publish();
     while !runner.is_finished() {
-        let woken = wait_for_anything(&mut runner, &mut punctual);
+        let woken = wait_for_anything(&mut runner, &mut rhythm);
         if woken.bell {
             runner.bell().silence();
         }
@@ -24,12 +24,19 @@ pub(super) fn run(mut runner: BusRunner) {
     runner.finish();
 }
 
+/// What the thread knows of its own waking up, and of how much there is to do.
+#[derive(Default)]
+struct Rhythm {
+    punctual: Punctual,
+    leisure: Leisure,
+}
+
 /// Waits for whatever comes first of the link, the bell and the time to go on.
-fn wait_for_anything(runner: &mut BusRunner, punctual: &mut Punctual) -> Woken {
-    let woken = match awake_at(runner, punctual) {
+fn wait_for_anything(runner: &mut BusRunner, rhythm: &mut Rhythm) -> Woken {
+    let woken = match awake_at(runner, rhythm) {
         Some(Awake { from, until }) if runner.clock().now() >= from => wait_awake(runner, until),
-        Some(Awake { from, .. }) => sleep(runner, punctual, Some(from)),
-        None => sleep(runner, punctual, None),
+        Some(Awake { from, .. }) => sleep(runner, rhythm, Some(from)),
+        None => sleep(runner, rhythm, None),
     };
     woken.unwrap_or_else(|lost| {
         runner.lose(lost);
@@ -50,15 +57,14 @@ const AWAKE_BEHIND: Duration = Duration::from_micros(150);
 /// When the reply under way will most likely come: a core that sleeps then would hear it some 50 µs late, which
 /// is time of the wire, and of whoever waits for the value. `None` where that is not known, is over, or nobody
 /// would gain by it.
-fn awake_at(runner: &BusRunner, punctual: &Punctual) -> Option<Awake> {
+fn awake_at(runner: &BusRunner, rhythm: &Rhythm) -> Option<Awake> {
     let expected_at = runner.link()?.reply_expected_at()?;
     let until = expected_at + AWAKE_BEHIND;
     let is_over = runner.clock().now() >= until || runner.wake_at().is_some_and(|at| at <= until);
-    if is_over || punctual.is_calm(expected_at) {
+    if is_over || rhythm.leisure.is_calm(expected_at) {
         return None;
     }
-    let begin = Time(expected_at.0.saturating_sub(AWAKE_BEFORE.as_micros() as u64));
-    Some(Awake { from: punctual.sleep_until(begin), until })
+    Some(Awake { from: rhythm.punctual.sleep_until(expected_at.before(AWAKE_BEFORE)), until })
 }
 
 /// Waits for the link and the bell until then, without sleeping.
@@ -75,28 +81,31 @@ fn wait_awake(runner: &BusRunner, until: Time) -> Result<Woken, Lost> {
 
 /// Sleeps until something comes, it is time to go on, or `at_most` has come. Before a request is sent the rest
 /// of that time is spun.
-fn sleep(runner: &mut BusRunner, punctual: &mut Punctual, at_most: Option<Time>) -> Result<Woken, Lost> {
+fn sleep(runner: &mut BusRunner, rhythm: &mut Rhythm, at_most: Option<Time>) -> Result<Woken, Lost> {
     let clock = runner.clock();
     let wake_at = runner.wake_at();
     let has_nothing_to_do = runner.link().is_some_and(|link| link.wake_at().is_none());
     let send_at = runner.link().and_then(|link| link.send_at());
     let exactly = send_at.filter(|at| Some(*at) == wake_at);
     let since = clock.now();
-    let until = exactly.map(|at| punctual.sleep_until(at)).or(wake_at);
+    let until = exactly
+        .filter(|at| !rhythm.leisure.is_calm(*at))
+        .map(|at| rhythm.punctual.sleep_until(at))
+        .or(wake_at);
     let until = until.into_iter().chain(at_most).min();
     let woken = wait(runner.link(), Some(runner.bell()), until.map(|until| until - since))?;
     if has_nothing_to_do {
-        punctual.rested(clock.now());
+        rhythm.leisure.rested(clock.now());
     }
     match (woken, until) {
         (Woken { link: true, .. }, _) => {
-            let came_at = punctual.woken_by(since, clock.now());
+            let came_at = rhythm.punctual.woken_by(since, clock.now());
             if let Some(link) = runner.link_mut() {
                 link.woken_by(came_at);
             }
         }
         (Woken { bell: false, .. }, Some(until)) => {
-            punctual.slept(since, until, clock.now());
+            rhythm.punctual.slept(since, until, clock.now());
             while exactly.is_some_and(|at| clock.now() < at) {
                 // A command that comes now still goes before the poll.
                 if runner.bell().rings() {

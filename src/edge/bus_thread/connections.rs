@@ -12,9 +12,11 @@ use super::wake_punctually;
 use crate::edge::bell::Bell;
 use crate::edge::bus_runner::BusRunner;
 use crate::edge::clock::Clock;
-use crate::edge::guarded_link::Woken;
+use crate::edge::doze::Doze;
+use crate::edge::guarded_link::{GuardedLink, Woken};
 use crate::edge::link::{Lost, timespec};
 use crate::edge::lock::lock;
+use crate::edge::punctual::{Leisure, Punctual};
 use crate::engine::time::{Duration, Time};
 
 /// Reaches the thread that runs the buses of all connections.
@@ -34,8 +36,15 @@ impl Connections {
         let shared = Arc::new(shared);
         let epoll = epoll::create(epoll::CreateFlags::CLOEXEC)?;
         epoll::add(&epoll, &shared.bell, epoll::EventData::new_u64(BELL), epoll::EventFlags::IN)?;
-        let (runners, of_thread) = (Vec::new(), shared.clone());
-        let thread = Thread { shared: of_thread, epoll, clock, runners, next_number: 0, wake_at: None };
+        let thread = Thread {
+            shared: shared.clone(),
+            epoll,
+            clock,
+            runners: Vec::new(),
+            next_number: 0,
+            wake_at: None,
+            punctual: Punctual::default(),
+        };
         std::thread::Builder::new().name("connections".into()).spawn(move || thread.run())?;
         Ok(shared)
     }
@@ -65,6 +74,9 @@ const MILLISECOND: Duration = Duration::from_millis(1);
 /// Links that are heard at one look.
 const HEARD_MAX: usize = 64;
 
+/// Of more links than these some reply is always near.
+const DOZES_WITH: usize = 64;
+
 struct Thread {
     shared: Arc<Connections>,
     epoll: OwnedFd,
@@ -74,6 +86,7 @@ struct Thread {
     next_number: u64,
     /// None of them wants to be woken before.
     wake_at: Option<Time>,
+    punctual: Punctual,
 }
 
 /// A bus, and the number by which `epoll` knows its link.
@@ -83,6 +96,9 @@ struct Numbered {
     wake_at: Option<Time>,
     /// Its link has bytes that have not been looked at.
     is_heard: bool,
+    /// When the reply under way will most likely come, where that is known and somebody would gain by it.
+    expected_at: Option<Time>,
+    leisure: Leisure,
 }
 
 impl Thread {
@@ -124,12 +140,48 @@ impl Thread {
     /// Where the bus is that the event is about, if there still is one.
     fn runner_of(&self, event: &epoll::Event) -> Option<usize> {
         let number = event.data.u64();
+        let first = self.runners.first()?.number;
+        // Until one of them ends, it is where it was put.
+        let guess = number.checked_sub(first)? as usize;
+        if self.runners.get(guess).is_some_and(|numbered| numbered.number == number) {
+            return Some(guess);
+        }
         self.runners.binary_search_by_key(&number, |numbered| numbered.number).ok()
     }
 
     /// Waits for whatever comes first.
-    fn wait(&self, heard: &mut Vec<epoll::Event>) {
-        let timeout = self.wake_at.map(|at| self.clock.until(at));
+    fn wait(&mut self, heard: &mut Vec<epoll::Event>) {
+        let since = self.clock.now();
+        let Some(doze) = self.doze(since) else { return self.sleep(heard, self.wake_at) };
+        self.sleep(heard, Some(doze.until));
+        let now = self.clock.now();
+        // Of a long time it has slept only whole milliseconds.
+        if heard.is_empty() && now >= doze.until {
+            self.punctual.slept(since, doze.until, now);
+            self.wait_awake(heard, doze.awake_until);
+        }
+    }
+
+    fn doze(&self, now: Time) -> Option<Doze> {
+        if self.runners.len() > DOZES_WITH {
+            return None;
+        }
+        let expected = self.runners.iter().filter_map(|numbered| numbered.expected_at);
+        Doze::before(expected, self.wake_at, &self.punctual, now)
+    }
+
+    /// Waits for links and the bell until then, without sleeping.
+    fn wait_awake(&self, heard: &mut Vec<epoll::Event>, until: Time) {
+        while heard.is_empty() && self.clock.now() < until {
+            // Whoever hands over the bytes may have been put on this core.
+            rustix::thread::sched_yield();
+            let _ = epoll::wait(&self.epoll, spare_capacity(heard), Some(&timespec(Duration::ZERO)));
+        }
+    }
+
+    /// Sleeps until something comes, or this time.
+    fn sleep(&self, heard: &mut Vec<epoll::Event>, until: Option<Time>) {
+        let timeout = until.map(|at| self.clock.until(at));
         // `epoll` counts in milliseconds and rounds them up; what is left of one, `poll` waits for.
         let timeout = match timeout {
             Some(left) if left < MILLISECOND => {
@@ -163,7 +215,7 @@ impl Thread {
     fn go_on(&mut self, at: usize, rung: bool) {
         let numbered = &mut self.runners[at];
         numbered.runner.woken(Woken { bell: rung, link: std::mem::take(&mut numbered.is_heard) });
-        numbered.settle(&self.epoll);
+        numbered.settle(&self.epoll, self.clock);
         // One that has ended is let go of at once.
         let wake_at = if numbered.runner.is_finished() { Some(Time(0)) } else { numbered.wake_at };
         self.wake_at = self.wake_at.into_iter().chain(wake_at).min();
@@ -173,8 +225,8 @@ impl Thread {
     fn welcome(&mut self) {
         for mut runner in lock(&self.shared.arrivals).drain(..) {
             runner.begin();
-            let mut numbered = Numbered { number: self.next_number, runner, wake_at: None, is_heard: false };
-            numbered.settle(&self.epoll);
+            let mut numbered = Numbered::new(self.next_number, runner);
+            numbered.settle(&self.epoll, self.clock);
             numbered.runner.publish();
             self.runners.push(numbered);
             self.next_number += 1;
@@ -183,8 +235,13 @@ impl Thread {
 }
 
 impl Numbered {
+    fn new(number: u64, runner: BusRunner) -> Numbered {
+        let leisure = Leisure::default();
+        Numbered { number, runner, wake_at: None, is_heard: false, expected_at: None, leisure }
+    }
+
     /// After the bus has done something: sees to it that it is woken for what comes next.
-    fn settle(&mut self, epoll: &OwnedFd) {
+    fn settle(&mut self, epoll: &OwnedFd, clock: Clock) {
         if self.runner.take_newly_open() {
             // A link that is closed leaves by itself.
             let heard = self.runner.link().map(|link| {
@@ -196,5 +253,10 @@ impl Numbered {
             }
         }
         self.wake_at = self.runner.wake_at();
+        if self.runner.link().is_some_and(|link| link.wake_at().is_none()) {
+            self.leisure.rested(clock.now());
+        }
+        let expected_at = self.runner.link().and_then(GuardedLink::reply_expected_at);
+        self.expected_at = expected_at.filter(|at| !self.leisure.is_calm(*at));
     }
 }
