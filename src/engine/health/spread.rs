@@ -32,22 +32,34 @@ const UPPER: [u64; BOUNDS] = {
 /// Many times of one kind.
 #[derive(Clone, Debug)]
 pub struct Spread {
-    counts: [u32; BUCKETS],
     sum: Duration,
     window: Duration,
     /// The number of the younger window, counted from the start, and when it ends.
     number: u64,
     ends_at: Time,
-    young: Window,
-    old: Window,
+    young: Extremes,
+    old: Extremes,
+    buckets: [Bucket; BUCKETS],
 }
 
+/// How many times were within its bounds. They lie together: with a thousand devices none of this is near when the
+/// next reply comes, and each piece of it has to be fetched.
+#[derive(Clone, Copy, Debug, Default)]
+struct Bucket {
+    ever: u32,
+    young: u16,
+    old: u16,
+}
+
+/// Of a window, in microseconds.
 #[derive(Clone, Copy, Debug)]
-struct Window {
-    counts: [u16; BUCKETS],
-    /// In microseconds.
+struct Extremes {
     least: u32,
     most: u32,
+}
+
+impl Extremes {
+    const NONE: Extremes = Extremes { least: u32::MAX, most: 0 };
 }
 
 /// What is told of a [`Spread`].
@@ -71,26 +83,27 @@ pub struct Percentiles {
 impl Spread {
     /// `window`: what is told of as lately is between this and twice as long ago.
     pub fn new(window: Duration) -> Spread {
-        let empty = Window { counts: [0; BUCKETS], least: u32::MAX, most: 0 };
         let ends_at = Time::default() + window;
-        let (young, old) = (empty, empty);
-        Spread { counts: [0; BUCKETS], sum: Duration::ZERO, window, number: 0, ends_at, young, old }
+        let (young, old) = (Extremes::NONE, Extremes::NONE);
+        let buckets = [Bucket::default(); BUCKETS];
+        Spread { sum: Duration::ZERO, window, number: 0, ends_at, young, old, buckets }
     }
 
     pub fn add(&mut self, now: Time, time: Duration) {
         self.turn_to(now);
         let micros = time.as_micros() as u64;
-        let bucket = UPPER.partition_point(|bound| *bound < micros);
-        self.counts[bucket] = self.counts[bucket].saturating_add(1);
         self.sum += time;
-        let young = &mut self.young;
-        if young.counts[bucket] == u16::MAX {
+        let bucket = UPPER.partition_point(|bound| *bound < micros);
+        if self.buckets[bucket].young == u16::MAX {
             // The shares stay as they are; a bucket that is full while others fill would not tell its own.
-            young.counts.iter_mut().for_each(|count| *count /= 2);
+            self.buckets.iter_mut().for_each(|bucket| bucket.young /= 2);
         }
-        young.counts[bucket] += 1;
-        young.least = young.least.min(micros.min(u64::from(u32::MAX)) as u32);
-        young.most = young.most.max(micros.min(u64::from(u32::MAX)) as u32);
+        let bucket = &mut self.buckets[bucket];
+        bucket.ever = bucket.ever.saturating_add(1);
+        bucket.young += 1;
+        let micros = micros.min(u64::from(u32::MAX)) as u32;
+        self.young.least = self.young.least.min(micros);
+        self.young.most = self.young.most.max(micros);
     }
 
     pub fn report(&self, now: Time) -> SpreadReport {
@@ -98,9 +111,9 @@ impl Spread {
         current.turn_to(now);
         let mut counts = [0; TOLD_BUCKETS];
         let mut told = 0;
-        for (bucket, count) in self.counts.iter().enumerate() {
-            counts[told] += count;
-            if bucket < BOUNDS && TOLD.contains(&(bucket % OF_DECADE.len())) {
+        for (number, bucket) in self.buckets.iter().enumerate() {
+            counts[told] += bucket.ever;
+            if number < BOUNDS && TOLD.contains(&(number % OF_DECADE.len())) {
                 told += 1;
             }
         }
@@ -114,14 +127,21 @@ impl Spread {
         }
         let window = (self.window.as_micros() as u64).max(1);
         let number = now.0 / window;
-        let empty = Window { counts: [0; BUCKETS], least: u32::MAX, most: 0 };
-        self.old = if number == self.number + 1 { self.young } else { empty };
-        (self.young, self.number, self.ends_at) = (empty, number, Time((number + 1) * window));
+        let is_next = number == self.number + 1;
+        for bucket in &mut self.buckets {
+            bucket.old = if is_next { bucket.young } else { 0 };
+            bucket.young = 0;
+        }
+        self.old = if is_next { self.young } else { Extremes::NONE };
+        self.young = Extremes::NONE;
+        (self.number, self.ends_at) = (number, Time((number + 1) * window));
     }
 
     fn percentiles(&self) -> Option<Percentiles> {
-        let count_of =
-            |bucket: usize| u32::from(self.young.counts[bucket]) + u32::from(self.old.counts[bucket]);
+        let count_of = |bucket: usize| {
+            let Bucket { young, old, .. } = self.buckets[bucket];
+            u32::from(young) + u32::from(old)
+        };
         let count: u32 = (0..BUCKETS).map(count_of).sum();
         if count == 0 {
             return None;
