@@ -7,10 +7,14 @@ use crate::engine::modbus::{Answer, Call, Identification, RequestError};
 /// The longest protocol data unit: function code and 252 bytes (4.1).
 pub const LENGTH_MAX: usize = 253;
 
+/// Most requests are no longer: function code, address, and a count or a value.
+const USUAL_LENGTH: usize = 5;
+
 /// The request's bytes, function code first. `Err` with the reason when the specification has no
 /// frame for it.
 pub fn encode(call: &Call) -> Result<Vec<u8>, &'static str> {
-    let mut pdu = vec![call.function()];
+    let mut pdu = Vec::with_capacity(USUAL_LENGTH);
+    pdu.push(call.function());
     match call {
         Call::Read(span) => {
             pdu.extend(span.first().to_be_bytes());

@@ -71,11 +71,11 @@ impl Guard {
         };
         self.transaction = self.transaction.wrapping_add(1);
         self.frame.clear();
-        self.frame.extend(self.transaction.to_be_bytes());
-        self.frame.extend([0, 0]);
-        self.frame.extend((pdu.len() as u16 + 1).to_be_bytes());
+        self.frame.extend_from_slice(&self.transaction.to_be_bytes());
+        self.frame.extend_from_slice(&[0, 0]);
+        self.frame.extend_from_slice(&(pdu.len() as u16 + 1).to_be_bytes());
         self.frame.push(request.unit);
-        self.frame.extend(pdu);
+        self.frame.extend_from_slice(&pdu);
         self.state = State::Begun { request: request.clone(), timeout };
         None
     }
@@ -100,11 +100,23 @@ impl Guard {
         if let State::Waiting { first_byte_at: first @ None, .. } = &mut self.state {
             *first = Some(now);
         }
-        let mut reply = None;
+        let mut heard = std::mem::take(&mut self.heard);
+        let (mut taken, mut reply) = (0, None);
         while self.broken.is_none() && reply.is_none() {
-            let Some(frame) = self.take_frame() else { break };
-            reply = self.frame_came(now, &frame);
+            match frame_length(&heard[taken..]) {
+                Ok(Some(length)) => {
+                    reply = self.frame_came(now, &heard[taken..taken + length]);
+                    taken += length;
+                }
+                Ok(None) => break,
+                Err(reason) => {
+                    self.broken = Some(reason);
+                    taken = heard.len();
+                }
+            }
         }
+        heard.drain(..taken);
+        self.heard = heard;
         match (self.broken, &self.state) {
             (Some(reason), State::Waiting { .. }) => self.link_lost(now, reason),
             _ => reply,
@@ -145,27 +157,6 @@ impl Guard {
         Some(Reply::new(Err(RequestError::Link(reason.to_owned())), sent_at, None, &mut self.discarded))
     }
 
-    /// The next whole frame, or why there will be none.
-    fn take_frame(&mut self) -> Option<Vec<u8>> {
-        let [_, _, protocol_high, protocol_low, high, low, ..] = *self.heard else { return None };
-        let length = usize::from(u16::from_be_bytes([high, low]));
-        if [protocol_high, protocol_low] != [0, 0] || !(2..=pdu::LENGTH_MAX + 1).contains(&length) {
-            self.broken = Some("the other side does not speak Modbus TCP");
-            self.heard.clear();
-            return None;
-        }
-        let whole = HEADER - 1 + length;
-        if self.heard.len() < whole {
-            return None;
-        }
-        if !may_begin_a_frame(&self.heard[whole..]) {
-            self.broken = Some("a frame is not as long as its header says");
-            self.heard.clear();
-            return None;
-        }
-        Some(self.heard.drain(..whole).collect())
-    }
-
     fn frame_came(&mut self, now: Time, frame: &[u8]) -> Option<Reply> {
         let transaction = u16::from_be_bytes([frame[0], frame[1]]);
         let waiting = match &self.state {
@@ -192,6 +183,21 @@ impl Guard {
         self.discarded.foreign_frames += u32::from(result == Err(RequestError::WrongFrame));
         self.state = State::Idle;
         Some(Reply::new(result, sent_at, Some((first_byte_at, now)), &mut self.discarded))
+    }
+}
+
+/// How long the frame is that these bytes begin with, where it is whole; or why there will be none.
+fn frame_length(heard: &[u8]) -> Result<Option<usize>, &'static str> {
+    let [_, _, protocol_high, protocol_low, high, low, ..] = *heard else { return Ok(None) };
+    let length = usize::from(u16::from_be_bytes([high, low]));
+    if [protocol_high, protocol_low] != [0, 0] || !(2..=pdu::LENGTH_MAX + 1).contains(&length) {
+        return Err("the other side does not speak Modbus TCP");
+    }
+    let whole = HEADER - 1 + length;
+    match heard.get(whole..) {
+        None => Ok(None),
+        Some(behind) if !may_begin_a_frame(behind) => Err("a frame is not as long as its header says"),
+        Some(_) => Ok(Some(whole)),
     }
 }
 
