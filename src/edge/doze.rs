@@ -12,28 +12,28 @@ const AWAKE_BEHIND: Duration = Duration::from_micros(10);
 /// Shorter sleeps are many, and a core is soon awake again behind them.
 const SLEEP_MIN: Duration = Duration::from_micros(200);
 
-/// A sleep, and a stretch of time without sleep behind it.
+/// A stretch of time in which a reply is waited for without sleeping.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Doze {
+pub struct Awake {
+    pub from: Time,
     pub until: Time,
-    pub awake_until: Time,
 }
 
-impl Doze {
+impl Awake {
     /// `expected`: when replies under way will most likely come. `wake_at`: when there is something else to do.
     /// `None`: no reply is expected, or not after a sleep that is long enough.
-    pub fn before(
+    pub fn for_the_next(
         expected: impl Iterator<Item = Time>,
         wake_at: Option<Time>,
         punctual: &Punctual,
         now: Time,
-    ) -> Option<Doze> {
+    ) -> Option<Awake> {
         // One that is overdue may be lost.
         let next = expected.filter(|at| now < *at + AWAKE_BEHIND).min()?;
-        let awake_until = next + AWAKE_BEHIND;
-        let until = punctual.doze_until(next.before(AWAKE_BEFORE));
-        let is_free = wake_at.is_none_or(|at| awake_until < at);
-        (is_free && until >= now + SLEEP_MIN).then_some(Doze { until, awake_until })
+        let from = punctual.doze_until(next.before(AWAKE_BEFORE));
+        let until = next + AWAKE_BEHIND;
+        let is_free = wake_at.is_none_or(|at| until < at);
+        (is_free && from >= now + SLEEP_MIN).then_some(Awake { from, until })
     }
 }
 
@@ -41,38 +41,38 @@ impl Doze {
 mod tests {
     use super::*;
 
-    /// The doze at 10 ms of a thread that wakes up 30 µs late.
-    fn doze(expected: &[u64], wake_at: Option<u64>) -> Option<(u64, u64)> {
+    /// When a thread is awake that sleeps from 10 ms on, and wakes up 30 µs late.
+    fn awake(expected: &[u64], wake_at: Option<u64>) -> Option<(u64, u64)> {
         let mut punctual = Punctual::default();
         (0..10).for_each(|_| punctual.slept(Time(0), Time(1000), Time(1030)));
         let expected = expected.iter().map(|at| Time(*at));
-        let doze = Doze::before(expected, wake_at.map(Time), &punctual, Time(10_000))?;
-        Some((doze.until.0, doze.awake_until.0))
+        let awake = Awake::for_the_next(expected, wake_at.map(Time), &punctual, Time(10_000))?;
+        Some((awake.from.0, awake.until.0))
     }
 
     #[test]
     fn it_ends_before_the_first_reply_by_what_a_wake_up_needs() {
-        assert_eq!(doze(&[], None), None);
-        assert_eq!(doze(&[11_500, 11_000, 12_000], None), Some((10_950, 11_010)));
+        assert_eq!(awake(&[], None), None);
+        assert_eq!(awake(&[11_500, 11_000, 12_000], None), Some((10_950, 11_010)));
     }
 
     #[test]
     fn a_reply_that_is_overdue_is_not_waited_for() {
-        assert_eq!(doze(&[9_000, 11_000], None), Some((10_950, 11_010)));
-        assert_eq!(doze(&[9_990], None), None);
+        assert_eq!(awake(&[9_000, 11_000], None), Some((10_950, 11_010)));
+        assert_eq!(awake(&[9_990], None), None);
     }
 
     #[test]
     fn behind_a_short_sleep_nothing_is_gained() {
-        assert_eq!(doze(&[10_249], None), None);
-        assert_eq!(doze(&[10_250], None), Some((10_200, 10_260)));
+        assert_eq!(awake(&[10_249], None), None);
+        assert_eq!(awake(&[10_250], None), Some((10_200, 10_260)));
         // The one that comes first decides.
-        assert_eq!(doze(&[9_995, 11_000], None), None);
+        assert_eq!(awake(&[9_995, 11_000], None), None);
     }
 
     #[test]
     fn what_else_is_to_be_done_is_done_in_time() {
-        assert_eq!(doze(&[11_000], Some(11_010)), None);
-        assert_eq!(doze(&[11_000], Some(11_011)), Some((10_950, 11_010)));
+        assert_eq!(awake(&[11_000], Some(11_010)), None);
+        assert_eq!(awake(&[11_000], Some(11_011)), Some((10_950, 11_010)));
     }
 }

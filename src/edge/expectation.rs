@@ -15,6 +15,9 @@ const REMEMBERED: usize = 256;
 /// Unit, function, address, and count or value.
 type Question = [u8; 6];
 
+/// Stands for every question where the reply to one takes as long as that to another.
+pub const ANY: Question = [0; 6];
+
 /// What is known of the replies on one line.
 #[derive(Debug, Default)]
 pub struct Expectation {

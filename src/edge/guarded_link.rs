@@ -6,7 +6,7 @@ use rustix::event::{PollFd, PollFlags, poll};
 
 use crate::edge::bell::Bell;
 use crate::edge::clock::Clock;
-use crate::edge::expectation::Expectation;
+use crate::edge::expectation::{ANY, Expectation};
 use crate::edge::link::{Link, Lost, timespec};
 use crate::engine::modbus::guard::Guard;
 use crate::engine::modbus::{Reply, Request, RequestError};
@@ -151,12 +151,12 @@ impl AsFd for GuardedLink {
     }
 }
 
-/// What is asked as often as the reply shall be expected: on a line the frame; on a network its length takes no
-/// time, and any question is as good as another.
+/// By what a question is known when it is asked again. On a line each takes a time of its own; on a network the
+/// length of a frame takes none.
 fn question(guard: &Guard) -> &[u8] {
     match guard {
         Guard::Rtu(guard) => guard.frame(),
-        Guard::Tcp(_) => &[0; 6],
+        Guard::Tcp(_) => &ANY,
     }
 }
 

@@ -82,7 +82,7 @@ impl Punctual {
     /// wake-up has ever been quicker.
     pub fn woken_by(&self, since: Time, now: Time) -> Time {
         let least = self.least.unwrap_or_default().min(LEAST_MAX);
-        Time(now.0.saturating_sub(least)).max(since)
+        now.before(Duration::from_micros(least)).max(since)
     }
 }
 

@@ -179,7 +179,7 @@ impl<'a> Rehearsal<'a> {
         // The silence before a request is taken by it, also where the line had long been silent.
         let bus = &self.settings.buses[self.index];
         let gap = bus.link.line().map_or(Duration::ZERO, |line| bus.gap.unwrap_or_else(|| line.frame_gap()));
-        let silent_from = Time(self.link.sent_at.0.saturating_sub(gap.as_micros() as u64));
+        let silent_from = self.link.sent_at.before(gap);
         let busy_from = self.link.decided_at.min(silent_from).max(self.busy_until);
         self.busy += self.now - busy_from;
         self.busy_until = self.now;

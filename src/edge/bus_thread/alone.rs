@@ -2,6 +2,7 @@
 
 use super::wake_punctually;
 use crate::edge::bus_runner::BusRunner;
+use crate::edge::doze::Awake;
 use crate::edge::guarded_link::{Woken, wait};
 use crate::edge::link::Lost;
 use crate::edge::punctual::{Leisure, Punctual};
@@ -42,12 +43,6 @@ fn wait_for_anything(runner: &mut BusRunner, rhythm: &mut Rhythm) -> Woken {
         runner.lose(lost);
         Woken { bell: true, link: true }
     })
-}
-
-/// A stretch of time in which a reply is waited for without sleeping.
-struct Awake {
-    from: Time,
-    until: Time,
 }
 
 /// So long before its usual time, and so long behind it, a reply is waited for without sleeping.

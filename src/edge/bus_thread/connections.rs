@@ -12,7 +12,7 @@ use super::wake_punctually;
 use crate::edge::bell::Bell;
 use crate::edge::bus_runner::BusRunner;
 use crate::edge::clock::Clock;
-use crate::edge::doze::Doze;
+use crate::edge::doze::Awake;
 use crate::edge::guarded_link::{GuardedLink, Woken};
 use crate::edge::link::{Lost, timespec};
 use crate::edge::lock::lock;
@@ -152,22 +152,23 @@ impl Thread {
     /// Waits for whatever comes first.
     fn wait(&mut self, heard: &mut Vec<epoll::Event>) {
         let since = self.clock.now();
-        let Some(doze) = self.doze(since) else { return self.sleep(heard, self.wake_at) };
-        self.sleep(heard, Some(doze.until));
+        let Some(awake) = self.awake(since) else { return self.sleep(heard, self.wake_at) };
+        self.sleep(heard, Some(awake.from));
         let now = self.clock.now();
         // Of a long time it has slept only whole milliseconds.
-        if heard.is_empty() && now >= doze.until {
-            self.punctual.slept(since, doze.until, now);
-            self.wait_awake(heard, doze.awake_until);
+        if heard.is_empty() && now >= awake.from {
+            self.punctual.slept(since, awake.from, now);
+            self.wait_awake(heard, awake.until);
         }
     }
 
-    fn doze(&self, now: Time) -> Option<Doze> {
+    /// When to be awake for the next reply, if that is worth it.
+    fn awake(&self, now: Time) -> Option<Awake> {
         if self.runners.len() > DOZES_WITH {
             return None;
         }
         let expected = self.runners.iter().filter_map(|numbered| numbered.expected_at);
-        Doze::before(expected, self.wake_at, &self.punctual, now)
+        Awake::for_the_next(expected, self.wake_at, &self.punctual, now)
     }
 
     /// Waits for links and the bell until then, without sleeping.

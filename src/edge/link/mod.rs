@@ -7,7 +7,7 @@ mod serial;
 mod tcp;
 
 use std::fmt;
-use std::io::{self, Read, Write};
+use std::io::{self, ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::os::fd::{AsFd, BorrowedFd};
 
@@ -69,7 +69,7 @@ impl Link {
             // End of file: the adapter was unplugged, the other side closed.
             Ok(0) => Err(self.ended()),
             Ok(count) => Ok(Some(count)),
-            Err(error) if is_for_later(&error) => Ok(None),
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Ok(None),
             Err(error) => Err(self.failed(error)),
         }
     }
@@ -83,8 +83,8 @@ impl Link {
             };
             match written {
                 Ok(count) => bytes = &bytes[count..],
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => self.wait_for_room()?,
-                Err(error) if is_for_later(&error) => {}
+                Err(error) if error.kind() == ErrorKind::WouldBlock => self.wait_for_room()?,
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) => return Err(self.failed(error)),
             }
         }
@@ -121,11 +121,6 @@ impl Link {
             _ => Lost(error.to_string()),
         }
     }
-}
-
-/// Nothing is wrong: there is nothing to be read or no room, or a signal came between.
-fn is_for_later(error: &io::Error) -> bool {
-    matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted)
 }
 
 /// A frame that the kernel does not take within this time is written to a dead link.

@@ -58,7 +58,7 @@ impl Bus {
             }
         };
         // The silence before a request is taken by it, also where the line had long been silent.
-        let silent_from = Time(sent_at.0.saturating_sub(gap.as_micros() as u64));
+        let silent_from = sent_at.before(gap);
         let busy_from = asked.decided_at.min(silent_from).max(self.times.busy_until);
         self.times.load.add(busy_from, now);
         self.times.busy_until = now;

@@ -71,11 +71,11 @@ impl Guard {
         };
         self.transaction = self.transaction.wrapping_add(1);
         self.frame.clear();
-        self.frame.extend_from_slice(&self.transaction.to_be_bytes());
-        self.frame.extend_from_slice(&[0, 0]);
-        self.frame.extend_from_slice(&(pdu.len() as u16 + 1).to_be_bytes());
+        self.frame.extend(self.transaction.to_be_bytes());
+        self.frame.extend([0, 0]);
+        self.frame.extend((pdu.len() as u16 + 1).to_be_bytes());
         self.frame.push(request.unit);
-        self.frame.extend_from_slice(&pdu);
+        self.frame.extend(pdu);
         self.state = State::Begun { request: request.clone(), timeout };
         None
     }
