@@ -30,10 +30,12 @@ impl Awake {
     ) -> Option<Awake> {
         // One that is overdue may be lost.
         let next = expected.filter(|at| now < *at + AWAKE_BEHIND).min()?;
-        let from = punctual.doze_until(next.before(AWAKE_BEFORE));
-        let until = next + AWAKE_BEHIND;
-        let is_free = wake_at.is_none_or(|at| until < at);
-        (is_free && from >= now + SLEEP_MIN).then_some(Awake { from, until })
+        let (from, until) = (next.before(AWAKE_BEFORE), next + AWAKE_BEHIND);
+        if from < now + SLEEP_MIN || wake_at.is_some_and(|at| until >= at) {
+            return None;
+        }
+        let from = punctual.doze_until(from);
+        (from >= now + SLEEP_MIN).then_some(Awake { from, until })
     }
 }
 

@@ -25,6 +25,8 @@ pub struct GuardedLink {
     /// When what is there to be read came, if that is known to be earlier than now.
     came_at: Option<Time>,
     expectation: Expectation,
+    /// What was last read from it. Not made anew, and filled with zeros, for each read.
+    buffer: [u8; 512],
 }
 
 impl GuardedLink {
@@ -36,6 +38,7 @@ impl GuardedLink {
             not_before: None,
             came_at: None,
             expectation: Expectation::default(),
+            buffer: [0; 512],
         }
     }
 
@@ -88,13 +91,13 @@ impl GuardedLink {
     /// Does what is due: reads, sends, tells the guard the time. Never waits. What is sent and what
     /// comes goes on the tape.
     pub fn advance(&mut self, tape: &mut Tape) -> Result<Option<Reply>, Lost> {
-        let mut buffer = [0; 512];
         let mut came_at = self.came_at.take();
         for _ in 0..READS_MAX {
-            let Some(count) = self.link.read(&mut buffer)? else { break };
+            let Some(count) = self.link.read(&mut self.buffer)? else { break };
             let time = came_at.take().unwrap_or_else(|| self.clock.now());
-            tape.heard(time, &buffer[..count]);
-            let reply = self.guard.received(time, &buffer[..count]);
+            let bytes = &self.buffer[..count];
+            tape.heard(time, bytes);
+            let reply = self.guard.received(time, bytes);
             if reply.is_some() {
                 self.expectation.answered(time);
                 return usable(reply);

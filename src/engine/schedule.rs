@@ -22,8 +22,9 @@ pub struct Polls {
 #[derive(Clone, Debug)]
 struct Planned {
     read: Arc<Read>,
-    /// That of the read, for whoever wants nothing else of it: what is not touched need not be fetched from memory.
+    /// Those of the read, for whoever wants nothing else of it: what is not touched need not be fetched from memory.
     span: Span,
+    poll: Poll,
     /// `None`: only after a connect or on request.
     period: Option<Duration>,
     /// Some point in it decides how others are read.
@@ -118,26 +119,31 @@ pub struct Waiting {
     began_at: Time,
     /// When it was last sent, if that is known.
     sent_at: Option<Time>,
-    period: Duration,
+    /// In microseconds, since it is reckoned with for each device of a bus before each request.
+    period: u64,
 }
 
 impl Waiting {
     /// By the time of the bus.
     fn due(&self) -> Time {
-        self.began_at + self.period
+        Time(self.began_at.0.saturating_add(self.period))
     }
 
     /// By the clock, if the bus has nothing to do until then: on a bus where nothing else is due it waits for no more
     /// than its period.
     fn due_at(&self, at: Moment) -> Time {
         let by_turns = at.now + (self.due() - at.until);
-        self.sent_at.map_or(by_turns, |sent_at| by_turns.min(sent_at + self.period))
+        self.sent_at.map_or(by_turns, |sent_at| by_turns.min(sent_at + self.period()))
+    }
+
+    fn period(&self) -> Duration {
+        Duration::from_micros(self.period)
     }
 
     /// `None`: it is not due.
     fn urgency(&self, at: Moment) -> Option<f64> {
         if at.turns >= self.due() {
-            return Some(periods(at.turns - self.began_at, self.period));
+            return Some((at.turns.0 - self.began_at.0) as f64 / self.period.max(1) as f64);
         }
         // What is due first goes first.
         (self.due_at(at) <= at.now).then(|| 1.0 / (1.0 + (self.due() - at.turns).as_secs_f64()))
@@ -181,6 +187,7 @@ impl Polls {
             },
             has_selector: read.points.iter().any(|(point, _)| is_selector(*point)),
             span: read.span,
+            poll: read.poll,
             read: Arc::new(read),
             began_at: None,
             sent_at: None,
@@ -201,13 +208,17 @@ impl Polls {
         &self.reads[index].read
     }
 
-    /// The same, for longer than the schedule can be borrowed.
-    pub fn shared_read(&self, index: usize) -> Arc<Read> {
-        self.reads[index].read.clone()
+    /// The same, for whoever wants to keep it.
+    pub fn shared_read(&self, index: usize) -> &Arc<Read> {
+        &self.reads[index].read
     }
 
     pub fn span(&self, index: usize) -> Span {
         self.reads[index].span
+    }
+
+    pub fn class(&self, index: usize) -> Poll {
+        self.reads[index].poll
     }
 
     pub fn len(&self) -> usize {
@@ -243,7 +254,7 @@ impl Polls {
                 return None;
             }
             if let Some(waiting) = planned.waiting() {
-                let oldest = &mut oldest[usize::from(planned.read.poll == Poll::Slow)];
+                let oldest = &mut oldest[usize::from(planned.poll == Poll::Slow)];
                 *oldest = Some(oldest.map_or(waiting, |oldest| oldest.or(waiting)));
             }
         }
@@ -298,8 +309,9 @@ impl Polls {
         let last = planned.sent_at.map(|sent_at| now - sent_at);
         planned.began_at = match in_turn {
             Some(waiting) => {
-                let stretch = last.map_or(1.0, |last| periods(last, waiting.period));
-                Some(pace.begin_turn(now, waiting.due(), waiting.period, stretch))
+                let period = waiting.period();
+                let stretch = last.map_or(1.0, |last| periods(last, period));
+                Some(pace.begin_turn(now, waiting.due(), period, stretch))
             }
             None => Some(pace.begin(now, planned.period)),
         };
@@ -332,7 +344,7 @@ impl Polls {
     /// The poll class's period as the bus keeps it now: that of the slowest of its reads, a read that
     /// is late included. `None` while no read has come round, or if there is none.
     pub fn real_period(&self, class: Poll, now: Time) -> Option<Duration> {
-        let of_class = self.reads.iter().filter(|planned| planned.read.poll == class && !planned.sleeps);
+        let of_class = self.reads.iter().filter(|planned| planned.poll == class && !planned.sleeps);
         let lasting = |planned: &Planned| {
             let waits = planned.sent_at.map(|sent_at| now - sent_at);
             planned.real_period.map(|period| waits.map_or(period, |waits| period.max(waits)))
@@ -477,10 +489,10 @@ impl Polls {
     ) {
         let old = std::mem::replace(self, Polls::new(reads, intervals, is_selector));
         let known = |span: Span, poll: Poll| {
-            old.reads.iter().find(|planned| planned.read.span == span && planned.read.poll == poll)
+            old.reads.iter().find(|planned| planned.span == span && planned.poll == poll)
         };
         for planned in &mut self.reads {
-            if let Some(before) = known(planned.read.span, planned.read.poll) {
+            if let Some(before) = known(planned.span, planned.poll) {
                 planned.began_at = before.began_at;
                 planned.sent_at = before.sent_at;
                 planned.real_period = before.real_period;
@@ -521,13 +533,14 @@ impl Planned {
         let waiting = self.waiting()?;
         if let Some(failed_at) = self.failed_at {
             let waited = (at.now - failed_at).saturating_sub(REPEATED_BEHIND);
-            return Some(Urgency::Overdue(periods(waited, waiting.period)));
+            return Some(Urgency::Overdue(periods(waited, waiting.period())));
         }
         waiting.urgency(at).map(Urgency::Overdue)
     }
 
     fn waiting(&self) -> Option<Waiting> {
-        Some(Waiting { began_at: self.began_at?, sent_at: self.sent_at, period: self.period? })
+        let period = self.period?.as_micros() as u64;
+        Some(Waiting { began_at: self.began_at?, sent_at: self.sent_at, period })
     }
 
     /// For how many of its periods it has waited, if that is enough. What has no period and is wanted counts in tens of

@@ -59,7 +59,10 @@ impl Bus {
             }
             let now = self.now;
             let runs_out = self.watchdogs_run_out();
-            let next = self.devices.most_urgent(now, &mut self.pace, |device| may_ask(device, runs_out));
+            // Who is not looked at need not be fetched from memory.
+            let may_all = !runs_out && !self.is_anyone_leaving;
+            let may_ask = |device: &DeviceState| may_all || may_ask(device, runs_out);
+            let next = self.devices.most_urgent(now, &mut self.pace, may_ask);
             let read_before_setting = std::mem::take(&mut self.wrote_setting);
             let read_before_request = self.requests_go_on();
             let Some(Next { device, polled, .. }) = next else {

@@ -183,11 +183,12 @@ const OF_REQUESTS: Duration = Duration::from_secs(10 * 60);
 /// Commands are rare.
 const OF_COMMANDS: Duration = Duration::from_secs(24 * 60 * 60);
 
-/// The times of one bus, or of one device. What has never happened takes no memory.
+/// The times of one bus, or of one device. What has never happened takes no memory, but for what happens with every
+/// request: that lies beside whatever else of the device is needed then.
 #[derive(Clone, Debug, Default)]
 pub struct Timing {
-    turnaround: Option<Box<Spread>>,
-    gap_wait: Option<Box<Spread>>,
+    turnaround: Option<Spread>,
+    gap_wait: Option<Spread>,
     lateness: Option<Box<Spread>>,
     command_wait: Option<Box<Spread>>,
 }
@@ -195,36 +196,40 @@ pub struct Timing {
 impl Timing {
     /// A device took so long from the request's last character to the first one of its answer.
     pub fn turned_around(&mut self, now: Time, time: Duration) {
-        add(&mut self.turnaround, OF_REQUESTS, now, time);
+        add_always(&mut self.turnaround, now, time);
     }
 
     /// A request waited so long for the line to be silent.
     pub fn waited_for_gap(&mut self, now: Time, time: Duration) {
-        add(&mut self.gap_wait, OF_REQUESTS, now, time);
+        add_always(&mut self.gap_wait, now, time);
     }
 
     /// A request began so long after it could have.
     pub fn began_late(&mut self, now: Time, time: Duration) {
-        add(&mut self.lateness, OF_REQUESTS, now, time);
+        add_seldom(&mut self.lateness, OF_REQUESTS, now, time);
     }
 
     /// A command waited so long until it was on the wire.
     pub fn command_waited(&mut self, now: Time, time: Duration) {
-        add(&mut self.command_wait, OF_COMMANDS, now, time);
+        add_seldom(&mut self.command_wait, OF_COMMANDS, now, time);
     }
 
     pub fn report(&self, now: Time) -> TimingReport {
-        let report = |spread: &Option<Box<Spread>>| spread.as_ref().map(|spread| spread.report(now));
+        let report = |spread: Option<&Spread>| spread.map(|spread| spread.report(now));
         TimingReport {
-            turnaround: report(&self.turnaround),
-            gap_wait: report(&self.gap_wait),
-            lateness: report(&self.lateness),
-            command_wait: report(&self.command_wait),
+            turnaround: report(self.turnaround.as_ref()),
+            gap_wait: report(self.gap_wait.as_ref()),
+            lateness: report(self.lateness.as_deref()),
+            command_wait: report(self.command_wait.as_deref()),
         }
     }
 }
 
-fn add(spread: &mut Option<Box<Spread>>, window: Duration, now: Time, time: Duration) {
+fn add_always(spread: &mut Option<Spread>, now: Time, time: Duration) {
+    spread.get_or_insert_with(|| Spread::new(OF_REQUESTS)).add(now, time);
+}
+
+fn add_seldom(spread: &mut Option<Box<Spread>>, window: Duration, now: Time, time: Duration) {
     spread.get_or_insert_with(|| Box::new(Spread::new(window))).add(now, time);
 }
 

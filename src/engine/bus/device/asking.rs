@@ -111,8 +111,8 @@ impl DeviceState {
     /// After a request in vain another one than the most urgent is asked: it may be that read alone which gets no
     /// answer. Not where it seems to be in step with what disturbs it: then it is asked twice in a row.
     fn asks_other_than(&self, index: usize) -> bool {
-        let read = self.polls.read(index);
-        self.patience.failures() % 3 == 1 && !self.withheld.is_in_step(read.span, read.poll)
+        let is_in_step = || self.withheld.is_in_step(self.polls.span(index), self.polls.class(index));
+        self.patience.failures() % 3 == 1 && !is_in_step()
     }
 
     pub(in crate::engine::bus) fn read_call(&self, index: usize) -> Polled {

@@ -36,8 +36,9 @@ impl DeviceState {
                     Answer::Words(words) => words,
                     bits => words_of(&bits),
                 };
-                let absorbed = self.values.absorb_poll(now, &self.settings.device, &read, &words);
+                let absorbed = self.values.absorb_poll(now, &self.settings.device, read, &words);
                 if !absorbed.is_told || self.told.is_anything_wanted() {
+                    let read = read.clone();
                     self.learn(now, &read, absorbed, context);
                     let again = self.told_again_after(read.poll, context.republish);
                     self.values.has_been_told(&read, again);

@@ -102,8 +102,7 @@ impl WithheldRead {
 impl DeviceState {
     /// The device has given the read.
     pub(super) fn given(&mut self, index: usize, context: &mut Context) {
-        let read = self.polls.read(index);
-        let (span, poll) = (read.span, read.poll);
+        let (span, poll) = (self.polls.span(index), self.polls.class(index));
         if self.withheld.end(span, poll) {
             let text = format!("device {}: {span} is answered again", self.settings.name);
             context.say(Severity::Info, text);
@@ -122,7 +121,7 @@ impl DeviceState {
         if !self.is_present() {
             return self.polls.want_again(index);
         }
-        let read = self.polls.shared_read(index);
+        let read = self.polls.shared_read(index).clone();
         let was_answered = self.polls.has_been_answered(index);
         let withheld = self.withheld.read(read.span, read.poll, was_answered, now);
         withheld.refused_since = None;
@@ -202,7 +201,7 @@ impl DeviceState {
     ) {
         self.polls.end(index);
         self.polls.pause(index, now + pause);
-        let read = self.polls.shared_read(index);
+        let read = self.polls.shared_read(index).clone();
         for (point, _) in &read.points {
             self.values.lose(*point, missing.clone());
             self.tell(now, *point, context);
