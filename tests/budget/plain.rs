@@ -7,8 +7,10 @@
 use busker::engine::bus::{Action, Bus, Command, Event};
 use busker::engine::memory::Memories;
 use busker::engine::modbus::{Answer, Call, Discarded, Reply, Request, RequestError};
+use busker::engine::request::{self, Verb, Wish};
 use busker::engine::settings::Settings;
-use busker::engine::time::{Duration, Time};
+use busker::engine::time::{Date, Duration, Time};
+use busker::engine::transaction::Transaction;
 use fastrand::Rng;
 
 use super::settings;
@@ -36,6 +38,8 @@ pub struct Plain {
     pub collides_each: Option<u64>,
     /// The other side closes each connection behind its answer.
     pub closes: bool,
+    /// Requests that were under way when the link broke.
+    pub lost: u32,
     settings: Settings,
     bus: Bus,
     to_send: Option<Sending>,
@@ -65,6 +69,7 @@ impl Plain {
             refuses: None,
             collides_each: None,
             closes: false,
+            lost: 0,
             bus: Bus::new(Time(0), &settings, 0, &Memories::default()),
             settings,
             to_send: None,
@@ -91,10 +96,18 @@ impl Plain {
     }
 
     pub fn break_link(&mut self) {
+        self.lost += u32::from(self.to_send.is_some() || self.answer.is_some());
         (self.to_send, self.answer) = (None, None);
         if self.reopen_at.is_none() {
             self.tell(Event::LinkDown("it broke".into()));
         }
+    }
+
+    /// Somebody wants the port for so long.
+    pub fn pause(&mut self, time: Duration) {
+        let wish = Wish::Pause { time, until: Date::default() };
+        let request = request::Request { verb: Verb::Pause, transaction: Transaction::default(), wish };
+        self.tell(Event::Request(request));
     }
 
     pub fn retire(&mut self, unit: usize) {

@@ -137,6 +137,22 @@ fn a_read_that_collides_each_time_comes_no_more_often() {
     assert!((59..=61).contains(&line.asked.len()), "{}", line.asked.len());
 }
 
+/// A request that is sent on a connection which the other side is about to close is lost, and its device seems to be as
+/// dead as the one whose silence was before it.
+#[test]
+fn where_each_connection_is_closed_also_behind_a_silence_no_request_is_lost() {
+    let unit = Unit { fast: 100, slow: 100, cost: 10, rest: 0, fast_reads: 2, slow_reads: 0, once_reads: 0 };
+    let units = vec![unit; 2];
+    let case = Case { is_network: true, closes: true, units, troubles: Vec::new() };
+    let mut line = Plain::new(&case.configuration(), vec![10; 2]);
+    line.closes = true;
+    line.run_for(SETTLES).expect("no fault");
+    line.lost = 0;
+    line.dead = Some(1);
+    line.run_for(20_000).expect("no fault");
+    assert_eq!(line.lost, 0);
+}
+
 /// Its reads are wanted again at once and wait for its silence: that is no reason to go before anything while it lasts.
 #[test]
 fn a_device_that_rests_and_is_busy_is_asked_when_the_bus_wakes_and_not_before() {
@@ -190,6 +206,8 @@ fn a_device_that_is_busy_takes_no_turns_from_others() {
 const UNEVENLY: f64 = 4.0;
 /// And so long in any case, behind a silence and what is asked again behind that.
 const SILENCE: f64 = 2.0;
+/// A device that dies is waited for so long, with the silences behind that: three requests, if each in another read.
+const DYING: f64 = 3.6;
 const WITHIN: f64 = 0.1;
 /// What has come round more seldom has no mean to speak of.
 const ROUNDS: usize = 30;
@@ -264,6 +282,8 @@ enum Trouble {
     Breaks(u64),
     /// It leaves the configuration, and comes back in the end.
     Leaves(usize),
+    /// Somebody wants the port, again and again for half of so many milliseconds.
+    Pauses(u64),
 }
 
 impl Trouble {
@@ -277,7 +297,7 @@ impl Trouble {
             | Trouble::Refuses(unit, _)
             | Trouble::Slow(unit)
             | Trouble::Leaves(unit) => Some(unit),
-            Trouble::Nothing | Trouble::Collisions(_) | Trouble::Breaks(_) => None,
+            Trouble::Nothing | Trouble::Collisions(_) | Trouble::Breaks(_) | Trouble::Pauses(_) => None,
         }
     }
 }
@@ -326,6 +346,7 @@ fn trouble() -> impl Strategy<Value = Trouble> {
         1 => (2..20_u64).prop_map(Trouble::Collisions),
         1 => log(100.0, 20_000.0).prop_map(Trouble::Breaks),
         1 => any.prop_map(Trouble::Leaves),
+        1 => log(2_000.0, 20_000.0).prop_map(Trouble::Pauses),
     ]
 }
 
@@ -489,6 +510,20 @@ impl Case {
                 line.run_for(lasts)?;
                 line.adopt(unit);
             }
+            Trouble::Pauses(every) => {
+                while line.now < until {
+                    let ends_at = line.now + Duration::from_millis(every / 2);
+                    line.pause(ends_at - line.now);
+                    // What has been decided on is asked, behind its silence.
+                    line.run_for(BEGUN)?;
+                    let asked = line.asked.len();
+                    line.run_for((ends_at - line.now).as_millis() as u64 - 1)?;
+                    if line.asked.len() > asked {
+                        return Err(format!("asked at {} in a pause", line.asked[asked].at));
+                    }
+                    line.run_for(every / 2)?;
+                }
+            }
         }
         Ok(())
     }
@@ -510,7 +545,11 @@ impl Case {
             }
             Trouble::Collisions(_) => self.look_for_starving(times, span, None, |of| of.cost() + COLLISION),
             // Others have to wait for its silence, and it is asked as seldom as it pleases.
-            Trouble::Dead(_) | Trouble::Breaks(_) => Ok(()),
+            Trouble::Dead(_) => {
+                let of_its_end = |waited: f64| (waited - DYING).max(0.0);
+                self.look_for_waits(times, span, Some(number_of(befallen)), Unit::cost, of_its_end)
+            }
+            Trouble::Breaks(_) | Trouble::Pauses(_) => Ok(()),
         }
     }
 
@@ -528,6 +567,18 @@ impl Case {
         away: Option<u8>,
         cost: impl Fn(&Unit) -> f64,
     ) -> Result<(), String> {
+        self.look_for_waits(times, [from, until], away, cost, |waited| waited)
+    }
+
+    /// The same; `counted`: how much of a wait is the schedule's affair.
+    fn look_for_waits(
+        &self,
+        times: &Times,
+        [from, until]: [Time; 2],
+        away: Option<u8>,
+        cost: impl Fn(&Unit) -> f64,
+        counted: impl Fn(f64) -> f64,
+    ) -> Result<(), String> {
         let load = self.load(&cost).max(1.0);
         let round: f64 = self.units.iter().map(|unit| unit.count() * cost(unit)).sum();
         for (read, period) in self.periods().into_iter().filter(|(read, _)| Some(read.0) != away) {
@@ -535,7 +586,7 @@ impl Case {
             let moments: Vec<Time> = [from].into_iter().chain(asked).chain([until]).collect();
             let longest =
                 moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).fold(0.0, f64::max);
-            self.within(read, longest, period, load, round)?;
+            self.within(read, counted(longest), period, load, round)?;
         }
         Ok(())
     }
@@ -613,6 +664,8 @@ impl Compared {
     }
 }
 
+/// What has begun is over after so many milliseconds.
+const BEGUN: u64 = 700;
 /// So many requests that somebody wants at once may go before a read.
 const AHEAD: f64 = 8.0;
 const SLOWER: u64 = 5;

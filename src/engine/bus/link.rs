@@ -5,7 +5,7 @@
 //! minute, and some close it behind each answer. It is made anew, and nobody need know.
 
 use super::{Action, Bus, InFlight, LinkState, Purpose, Severity};
-use crate::engine::modbus::RequestError;
+use crate::engine::modbus::{Answer, RequestError};
 use crate::engine::settings::Link;
 use crate::engine::time::{Duration, Time};
 
@@ -174,13 +174,12 @@ impl Bus {
         }
     }
 
-    /// After an answer: a connection that is good for one request is not used for a second one, which
-    /// nobody would hear.
-    pub(super) fn renew_used_connection(&mut self) {
-        if self.connection.is_for_single_use()
-            && self.connection.answers > 0
-            && self.link_state == LinkState::Up
-        {
+    /// After a request: a connection that is good for one is not used for a second one, which nobody would hear. Also
+    /// where the first had no answer: the other side may close it at any moment, and the second would be lost for the
+    /// sake of a device that is silent.
+    pub(super) fn renew_used_connection(&mut self, result: &Result<Answer, RequestError>) {
+        let was_used = !matches!(result, Err(RequestError::Link(_) | RequestError::Impossible(_)));
+        if was_used && self.connection.is_for_single_use() && self.link_state == LinkState::Up {
             self.renew();
         }
     }

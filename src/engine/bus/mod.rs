@@ -450,7 +450,7 @@ impl Bus {
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         self.count_turn(&in_flight, &reply);
         // Before anything more is asked on it.
-        self.renew_used_connection();
+        self.renew_used_connection(&reply.result);
         self.renew_silent_connection();
         self.request_ended(in_flight, reply.result);
         if let Some((device, silence)) = silence {
