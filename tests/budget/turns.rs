@@ -546,8 +546,7 @@ impl Case {
             Trouble::Collisions(_) => self.look_for_starving(times, span, None, |of| of.cost() + COLLISION),
             // Others have to wait for its silence, and it is asked as seldom as it pleases.
             Trouble::Dead(_) => {
-                let of_its_end = |waited: f64| (waited - DYING).max(0.0);
-                self.look_for_waits(times, span, Some(number_of(befallen)), Unit::cost, of_its_end)
+                self.look_for_starving_but_for(DYING, times, span, Some(number_of(befallen)), Unit::cost)
             }
             Trouble::Breaks(_) | Trouble::Pauses(_) => Ok(()),
         }
@@ -563,21 +562,21 @@ impl Case {
     fn look_for_starving(
         &self,
         times: &Times,
-        [from, until]: [Time; 2],
+        span: [Time; 2],
         away: Option<u8>,
         cost: impl Fn(&Unit) -> f64,
     ) -> Result<(), String> {
-        self.look_for_waits(times, [from, until], away, cost, |waited| waited)
+        self.look_for_starving_but_for(0.0, times, span, away, cost)
     }
 
-    /// The same; `counted`: how much of a wait is the schedule's affair.
-    fn look_for_waits(
+    /// The same where so many seconds of a wait are no affair of the schedule's.
+    fn look_for_starving_but_for(
         &self,
+        seconds: f64,
         times: &Times,
         [from, until]: [Time; 2],
         away: Option<u8>,
         cost: impl Fn(&Unit) -> f64,
-        counted: impl Fn(f64) -> f64,
     ) -> Result<(), String> {
         let load = self.load(&cost).max(1.0);
         let round: f64 = self.units.iter().map(|unit| unit.count() * cost(unit)).sum();
@@ -586,7 +585,7 @@ impl Case {
             let moments: Vec<Time> = [from].into_iter().chain(asked).chain([until]).collect();
             let longest =
                 moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).fold(0.0, f64::max);
-            self.within(read, counted(longest), period, load, round)?;
+            self.within(read, longest - seconds, period, load, round)?;
         }
         Ok(())
     }
