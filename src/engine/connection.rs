@@ -4,9 +4,9 @@
 use crate::engine::outbox::may_be_too_long;
 use crate::engine::time::{Duration, Time};
 
-/// Pauses between attempts begin here and double.
+/// Pauses between attempts begin here and double, to no more than somebody waits who has put the cable back in.
 const PAUSE_FIRST: Duration = Duration::from_millis(500);
-const PAUSE_LAST: Duration = Duration::from_secs(30);
+const PAUSE_LAST: Duration = Duration::from_secs(8);
 
 /// A broker that closes the connection over a long message has done so at once, and lets us in again at once.
 const ATTEMPTS_TOO_LONG: u32 = 1;
@@ -15,9 +15,10 @@ const ATTEMPTS_TOO_LONG: u32 = 1;
 const GOOD_AFTER: Duration = Duration::from_secs(10);
 
 /// The same for a place that somebody else wants: two gateways that give way to each other shall not
-/// take the other's pause for a good connection.
-const PAUSE_LAST_CONTESTED: Duration = Duration::from_secs(120);
-const GOOD_AFTER_CONTESTED: Duration = Duration::from_secs(300);
+/// take the other's pause for a good connection. Nor shall one be away for long that only thinks so, since a broker
+/// has closed its connection so often for another reason.
+const PAUSE_LAST_CONTESTED: Duration = Duration::from_secs(30);
+const GOOD_AFTER_CONTESTED: Duration = Duration::from_secs(60);
 
 /// A broker that accepts us at once and closes the connection this soon, this often in a row, most likely
 /// does so for the sake of another client with our identifier: MQTT 3.1.1 has no words for the reason. One
@@ -202,10 +203,10 @@ mod tests {
             (0, false, 500),
             (1, false, 1000),
             (2, false, 2000),
-            (6, false, 30_000),
-            (40, false, 30_000),
+            (4, false, 8000),
+            (40, false, 8000),
             (2, true, 2000),
-            (40, true, 120_000),
+            (40, true, 30_000),
         ] {
             let pauses: Vec<Duration> =
                 (0..100).map(|seed| pause(attempts, contested, seed * 1017)).collect();
@@ -292,18 +293,18 @@ mod tests {
     fn a_contested_place_is_given_up_for_longer_until_it_is_kept_for_long() {
         let mut connection = Connection::default();
         let (mut now, mut pauses) = (0, Vec::new());
-        for _ in 0..10 {
+        for _ in 0..11 {
             connection.made(at(now));
             pauses.push(lose(&mut connection, at(now + 20), Loss::Closed).as_secs());
             now += 30;
         }
         // The first few may have been anything.
-        assert_eq!(pauses, [0, 0, 0, 0, 1, 2, 4, 8, 16, 32]);
+        assert_eq!(pauses, [0, 0, 0, 0, 1, 2, 4, 8, 16, 30, 30]);
         connection.made(at(now));
-        assert!(connection.is_contested(at(now + 299)));
-        assert!(!connection.is_contested(at(now + 300)));
-        assert_eq!(lose(&mut connection, at(now + 300), Loss::Closed), PAUSE_FIRST);
-        assert!(!connection.is_contested(at(now + 301)));
+        assert!(connection.is_contested(at(now + 59)));
+        assert!(!connection.is_contested(at(now + 60)));
+        assert_eq!(lose(&mut connection, at(now + 60), Loss::Closed), PAUSE_FIRST);
+        assert!(!connection.is_contested(at(now + 61)));
     }
 
     #[test]

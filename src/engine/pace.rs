@@ -108,15 +108,25 @@ impl Pace {
         self.clock(now).min(self.time + period.unwrap_or_default())
     }
 
-    /// A read begins in its turn that was due then, in the bus's time, after so many times its period. From when on it
-    /// counts its next one.
-    pub fn begin_turn(&mut self, now: Time, due: Time, period: Duration, stretch: f64) -> Time {
+    /// A read begins in its turn that was due then, in the bus's time, after so many times its period. `of_device`: after
+    /// how many those of its device come round, on average. From when on it counts its next one.
+    pub fn begin_turn(
+        &mut self,
+        now: Time,
+        due: Time,
+        period: Duration,
+        stretch: f64,
+        of_device: impl FnOnce() -> f64,
+    ) -> Time {
         self.busy(now);
         self.stretch = (self.stretch + (stretch - self.stretch) * Pace::STEP).max(1.0);
         let behind = self.time - due;
         if self.keeps_up(now) && behind >= period {
-            // It was the device itself that kept it waiting: that is not made up for.
-            return self.time;
+            // It was the device itself that kept it waiting: that is not made up for. But what others of its reads have had
+            // of its turns meanwhile is, so that the device stretches them alike.
+            let comes_round_in = period.mul_f64(of_device());
+            let should_have_begun = due.before(period) + comes_round_in;
+            return should_have_begun.max(self.time.before(comes_round_in)).min(self.time);
         }
         let until = self.time + self.owed;
         let ahead = due.min(until) - self.time;

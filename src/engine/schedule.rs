@@ -295,11 +295,19 @@ impl Polls {
         awake.filter_map(|planned| Some(1.0 / planned.period?.as_secs_f64().max(1e-6))).sum()
     }
 
+    /// By how much longer than wanted it takes until the reads come round, on average of all turns.
+    fn stretch(&self) -> f64 {
+        let awake = self.reads.iter().filter(|planned| !planned.sleeps);
+        let had =
+            awake.filter_map(|planned| planned.period.map(|period| planned.real_period.unwrap_or(period)));
+        self.wanted() / had.map(|period| 1.0 / period.as_secs_f64().max(1e-6)).sum::<f64>()
+    }
+
     /// The read is being sent; returns where it stood before. `pace` is that of the
     /// whole bus.
     pub fn begin(&mut self, index: usize, now: Time, pace: &mut Pace) -> Place {
         let (at, lets_ahead) = (pace.at(now), pace.lets_ahead());
-        let planned = &mut self.reads[index];
+        let planned = &self.reads[index];
         let Planned { began_at, sent_at, real_period, wanted_now, failed_at, .. } = *planned;
         let is_for_period = !wanted_now && failed_at.is_none();
         // Whoever feeds a watchdog does not wait until it is due.
@@ -307,14 +315,16 @@ impl Polls {
         let in_turn =
             planned.waiting().filter(|waiting| is_for_period && waiting.urgency(at).is_some_and(has_turn));
         let last = planned.sent_at.map(|sent_at| now - sent_at);
-        planned.began_at = match in_turn {
+        let counts_from = match in_turn {
             Some(waiting) => {
                 let period = waiting.period();
                 let stretch = last.map_or(1.0, |last| periods(last, period));
-                Some(pace.begin_turn(now, waiting.due(), period, stretch))
+                pace.begin_turn(now, waiting.due(), period, stretch, || self.stretch())
             }
-            None => Some(pace.begin(now, planned.period)),
+            None => pace.begin(now, planned.period),
         };
+        let planned = &mut self.reads[index];
+        planned.began_at = Some(counts_from);
         // A read that was wanted out of turn says nothing about the turns. One that was kept waiting is followed by one
         // that makes up for it.
         if is_for_period {

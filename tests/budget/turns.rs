@@ -123,6 +123,47 @@ fn nobody_starves_where_somebody_did() {
     assert!(all.shows_something(), "{all:?}");
 }
 
+/// It is no matter of the bus, which has time enough; but whom the device keeps waiting for its silence, it keeps waiting
+/// alike.
+#[test]
+fn a_device_that_wants_more_than_its_silence_allows_stretches_all_its_reads_alike() {
+    let resting = |[fast, slow, rest]: [u64; 3], [fast_reads, slow_reads]: [u16; 2]| Unit {
+        fast,
+        slow,
+        cost: 1,
+        rest,
+        fast_reads,
+        slow_reads,
+        once_reads: 0,
+    };
+    let other = resting([70, 70, 0], [1, 0]);
+    for units in [
+        vec![resting([72, 288, 151], [2, 3])],
+        vec![resting([72, 288, 151], [2, 3]), other.clone()],
+        vec![resting([100, 2_000, 150], [1, 4])],
+        vec![resting([200, 2_000, 150], [1, 4]), other.clone()],
+        vec![resting([300, 1_200, 151], [2, 3])],
+        vec![resting([5, 60, 40], [3, 1])],
+    ] {
+        let case = Case { is_network: true, closes: false, units, troubles: Vec::new() };
+        let mut line = Plain::new(&case.configuration(), vec![1; 2]);
+        line.run_for(SETTLES).expect("no fault");
+        line.asked.clear();
+        line.run_for(300_000).expect("no fault");
+        let times = times(&mut line);
+        let stretch = |(read, period): (_, f64)| {
+            let asked: &Vec<Time> = &times[&read];
+            (asked[asked.len() - 1] - asked[0]).as_secs_f64() / (asked.len() - 1) as f64 / period
+        };
+        let of_first = case.periods().into_iter().filter(|(read, _)| read.0 == 1);
+        let stretches: Vec<f64> = of_first.map(stretch).collect();
+        let (least, most) = stretches
+            .iter()
+            .fold((f64::MAX, 0.0_f64), |(least, most), one| (least.min(*one), most.max(*one)));
+        assert!(most > 1.05 && most < least * (1.0 + WITHIN), "{stretches:.3?}\n{}", case.configuration());
+    }
+}
+
 /// What is asked again at once is one turn, and its period is not over the sooner.
 #[test]
 fn a_read_that_collides_each_time_comes_no_more_often() {
