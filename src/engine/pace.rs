@@ -124,9 +124,10 @@ impl Pace {
         if self.keeps_up(now) && behind >= period {
             // It was the device itself that kept it waiting: that is not made up for. But what others of its reads have had
             // of its turns meanwhile is, so that the device stretches them alike.
-            let comes_round_in = period.mul_f64(of_device());
-            let should_have_begun = due.before(period) + comes_round_in;
-            return should_have_begun.max(self.time.before(comes_round_in)).min(self.time);
+            let usual = period.mul_f64(of_device().max(1.0));
+            let should_have_begun = due.before(period) + usual;
+            let is_unusual = self.time - should_have_begun > usual * Pace::BEHIND_MOST;
+            return if is_unusual { self.time } else { should_have_begun.min(self.time) };
         }
         let until = self.time + self.owed;
         let ahead = due.min(until) - self.time;

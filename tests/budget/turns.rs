@@ -144,6 +144,8 @@ fn a_device_that_wants_more_than_its_silence_allows_stretches_all_its_reads_alik
         vec![resting([200, 2_000, 150], [1, 4]), other.clone()],
         vec![resting([300, 1_200, 151], [2, 3])],
         vec![resting([5, 60, 40], [3, 1])],
+        vec![resting([100, 2_000, 240], [1, 4])],
+        vec![resting([100, 500, 100], [1, 4])],
     ] {
         let case = Case { is_network: true, closes: false, units, troubles: Vec::new() };
         let mut line = Plain::new(&case.configuration(), vec![1; 2]);
