@@ -122,12 +122,14 @@ impl Pace {
         self.stretch = (self.stretch + (stretch - self.stretch) * Pace::STEP).max(1.0);
         let behind = self.time - due;
         if self.keeps_up(now) && behind >= period {
-            // It was the device itself that kept it waiting: that is not made up for. But what others of its reads have had
-            // of its turns meanwhile is, so that the device stretches them alike.
-            let usual = period.mul_f64(of_device().max(1.0));
+            // It was the device itself that kept it waiting: that is not made up for. But where that is usual, what others
+            // of its reads have had of its turns meanwhile is, so that the device stretches them alike.
+            let of_device = of_device();
+            let usual = period.mul_f64(of_device.max(1.0));
             let should_have_begun = due.before(period) + usual;
-            let is_unusual = self.time - should_have_begun > usual * Pace::BEHIND_MOST;
-            return if is_unusual { self.time } else { should_have_begun.min(self.time) };
+            let is_usual =
+                of_device > Pace::BEHIND && self.time - should_have_begun <= usual * Pace::BEHIND_MOST;
+            return if is_usual { should_have_begun.min(self.time) } else { self.time };
         }
         let until = self.time + self.owed;
         let ahead = due.min(until) - self.time;

@@ -141,7 +141,7 @@ fn a_device_that_wants_more_than_its_silence_allows_stretches_all_its_reads_alik
         vec![resting([72, 288, 151], [2, 3])],
         vec![resting([72, 288, 151], [2, 3]), other.clone()],
         vec![resting([100, 2_000, 150], [1, 4])],
-        vec![resting([200, 2_000, 150], [1, 4]), other.clone()],
+        vec![resting([140, 2_000, 150], [1, 4]), other.clone()],
         vec![resting([300, 1_200, 151], [2, 3])],
         vec![resting([5, 60, 40], [3, 1])],
         vec![resting([100, 2_000, 240], [1, 4])],

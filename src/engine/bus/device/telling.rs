@@ -209,17 +209,23 @@ impl DeviceState {
         }
     }
 
-    /// The first of the thing's states whose row holds, or why there is none.
+    /// The first of the thing's states whose row holds, or why there is none. One that might hold, if a point were known
+    /// that has no value now, keeps those behind it from being told.
     pub(super) fn state_of<'t>(&self, thing: &'t Thing) -> Result<&'t str, Missing> {
         if !codec::lives(self.device(), &thing.when, self.known())? {
             return Err(Missing::NotInThisMode);
         }
-        let says = |(point, text): &(PointIndex, String)| match self.values.reading(*point) {
+        let denies = |(point, text): &(PointIndex, String)| match self.values.reading(*point) {
             Reading::Missing(_) => false,
-            reading => reading.to_string() == *text,
+            reading => reading.to_string() != *text,
         };
-        let state = thing.states.iter().find(|state| state.row.iter().all(says));
-        state.map(|state| state.name.as_str()).ok_or(Missing::NoState)
+        let is_missing = |point: &PointIndex| matches!(self.values.reading(*point), Reading::Missing(_));
+        let state = thing.states.iter().find(|state| !state.row.iter().any(denies));
+        let state = state.ok_or(Missing::NoState)?;
+        match state.row.iter().map(|(point, _)| *point).find(is_missing) {
+            Some(point) => Err(Missing::WaitingFor(self.details(point).name.clone())),
+            None => Ok(&state.name),
+        }
     }
 
     /// The thing is told again even if it has not changed.
