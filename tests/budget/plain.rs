@@ -31,7 +31,7 @@ pub struct Plain {
     /// Somebody commands this unit's point `w` as soon as the command before has been written.
     pub flood: Option<usize>,
     /// It does not answer.
-    pub dead: Option<usize>,
+    pub dead: Vec<usize>,
     /// It answers with this exception.
     pub refuses: Option<(usize, u8)>,
     /// Each so-manieth request meets another's.
@@ -65,7 +65,7 @@ impl Plain {
             asked: Vec::new(),
             costs,
             flood: None,
-            dead: None,
+            dead: Vec::new(),
             refuses: None,
             collides_each: None,
             closes: false,
@@ -181,7 +181,7 @@ impl Plain {
         let index = usize::from(request.unit) - 1;
         let mut took = Duration::from_millis(self.costs[index]);
         let result = match &request.call {
-            _ if self.dead == Some(index) => Err(RequestError::Timeout),
+            _ if self.dead.contains(&index) => Err(RequestError::Timeout),
             _ if self.collides_each.is_some_and(|each| self.requests % each == 0) => {
                 Err(RequestError::Collision)
             }

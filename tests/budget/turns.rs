@@ -191,9 +191,56 @@ fn where_each_connection_is_closed_also_behind_a_silence_no_request_is_lost() {
     line.closes = true;
     line.run_for(SETTLES).expect("no fault");
     line.lost = 0;
-    line.dead = Some(1);
+    line.dead = vec![1];
     line.run_for(20_000).expect("no fault");
     assert_eq!(line.lost, 0);
+}
+
+/// A part of a cabinet loses its power: each of its units is asked three times in vain, and the others have the line for
+/// as long in between.
+#[test]
+fn where_many_die_at_once_the_others_are_asked_between_one_silence_and_the_next() {
+    for (fast, reads, count, dead) in [
+        (10, 1, 10, 5),
+        (10, 1, 20, 10),
+        (10, 1, 10, 9),
+        (1_000, 1, 10, 5),
+        (1_000, 3, 10, 5),
+        (1_000, 1, 30, 25),
+    ] {
+        let unit =
+            Unit { fast, slow: fast, cost: 37, rest: 0, fast_reads: reads, slow_reads: 0, once_reads: 0 };
+        let case = Case { is_network: false, closes: false, units: vec![unit; count], troubles: Vec::new() };
+        let mut line = Plain::new(&case.configuration(), vec![37; count]);
+        line.run_for(SETTLES).expect("no fault");
+        line.dead = (count - dead..count).collect();
+        line.asked.clear();
+        let from = line.now;
+        line.run_for(60_000).expect("no fault");
+        let until = line.now;
+        let mut times = times(&mut line);
+        let round = 0.037 * f64::from(reads) * count as f64;
+        // Each of the dead may come first before it is known to be silent. It is waited for, the line is left alone for as
+        // long again, and the others have it for as long.
+        let most = dead as f64 * 3.0 * 0.5 + round.max(fast as f64 / 1e3);
+        let what = format!("{dead} of {count} with {reads} reads each {fast} ms");
+        for (read, period) in
+            case.periods().into_iter().filter(|(read, _)| usize::from(read.0) <= count - dead)
+        {
+            let asked = times.remove(&read).unwrap_or_default();
+            let moments: Vec<Time> = [from].into_iter().chain(asked).chain([until]).collect();
+            let waits = moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64());
+            let longest = waits.fold(0.0, f64::max);
+            assert!(longest <= most, "{what}: {read:?} waited for {longest:.2} s, more than {most:.2} s");
+            // Two such silences, and then half a second: a fifth of the time.
+            let least = 60.0 / period.max(round) / 5.0;
+            assert!(
+                moments.len() as f64 >= least,
+                "{what}: {read:?} had {} turns, less than {least:.0}",
+                moments.len()
+            );
+        }
+    }
 }
 
 /// Its reads are wanted again at once and wait for its silence: that is no reason to go before anything while it lasts.
@@ -523,9 +570,9 @@ impl Case {
                 }
             }
             Trouble::Dead(_) => {
-                line.dead = Some(unit);
+                line.dead = vec![unit];
                 line.run_for(lasts)?;
-                line.dead = None;
+                line.dead.clear();
             }
             Trouble::Refuses(_, code) => {
                 line.refuses = Some((unit, code));

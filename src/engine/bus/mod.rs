@@ -154,6 +154,8 @@ pub struct Bus {
     /// Heartbeats and feedings of watchdogs in a row.
     fed_in_a_row: u32,
     pace: Pace,
+    /// Before, who has left something unanswered goes behind all others: see [`turns::SILENCES_IN_A_ROW`].
+    doubtful_from: Time,
     link_state: LinkState,
     connection: link::Connection,
     /// A device on this link needs silence behind a connect: nothing is asked before.
@@ -278,6 +280,7 @@ impl Bus {
             link_state: LinkState::Down { reason: None, attempts: 0 },
             connection: link::Connection::default(),
             silent_until: now,
+            doubtful_from: now,
             unanswered: 0,
             broker_up: true,
             counters,
@@ -449,6 +452,7 @@ impl Bus {
         let silence = in_flight.device.zip(self.silence_behind(&reply));
         let Some(in_flight) = self.repeat_collided(in_flight, &reply) else { return };
         self.count_turn(&in_flight, &reply);
+        let took = self.now - in_flight.decided_at;
         // Before anything more is asked on it.
         self.renew_used_connection(&reply.result);
         self.renew_silent_connection();
@@ -456,6 +460,7 @@ impl Bus {
         if let Some((device, silence)) = silence {
             self.keep_silence(device, &silence);
         }
+        self.put_doubtful_off(took);
     }
 
     /// Gives the answer to whoever wanted it.

@@ -24,6 +24,12 @@ pub const AHEAD_OF_READS: u32 = 8;
 /// command, perhaps, that puts the time right.
 const FED_IN_A_ROW: u32 = 8;
 
+/// Behind so many silences in a row the others have the line for as long as the last one took, if there is anything to ask
+/// them, before a device is asked again that has been silent already. Where half of a cabinet has lost its
+/// power each of its devices has to be asked three times in vain, and that may not be all that the line does meanwhile.
+/// (Behind each single one, a device on a disturbed line would be asked too seldom.)
+pub(super) const SILENCES_IN_A_ROW: u32 = 2;
+
 impl Bus {
     /// Asks what is to be asked next, if the line is free.
     pub(super) fn ask_next(&mut self) {
@@ -62,7 +68,12 @@ impl Bus {
             // Who is not looked at need not be fetched from memory.
             let may_all = !runs_out && !self.is_anyone_leaving;
             let may_ask = |device: &DeviceState| may_all || may_ask(device, runs_out);
-            let next = self.devices.most_urgent(now, &mut self.pace, may_ask);
+            let may_go_first = |device: &DeviceState| may_ask(device) && !device.is_doubtful();
+            let first = match now < self.doubtful_from {
+                true => self.devices.most_urgent(now, &mut self.pace, may_go_first),
+                false => None,
+            };
+            let next = first.or_else(|| self.devices.most_urgent(now, &mut self.pace, may_ask));
             let read_before_setting = std::mem::take(&mut self.wrote_setting);
             let read_before_request = self.requests_go_on();
             let Some(Next { device, polled, .. }) = next else {
@@ -113,6 +124,13 @@ impl Bus {
             self.ahead += 1;
         } else if matches!(ended.purpose, Purpose::Poll { .. }) {
             self.nobody_was_kept_waiting(ended.decided_at);
+        }
+    }
+
+    /// The request that has just ended took so long. If nobody answered it, nor the one before, others have the line first.
+    pub(super) fn put_doubtful_off(&mut self, took: Duration) {
+        if self.unanswered >= SILENCES_IN_A_ROW {
+            self.doubtful_from = self.now.max(self.line.polls_from()) + took;
         }
     }
 

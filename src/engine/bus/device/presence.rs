@@ -196,6 +196,11 @@ impl DeviceState {
         self.patience.is_probing()
     }
 
+    /// Whether it has left something unanswered since its last answer, but not yet so often that it counts as offline.
+    pub(in crate::engine::bus) fn is_doubtful(&self) -> bool {
+        self.patience.failures() > 0 && !self.patience.is_probing()
+    }
+
     /// A late answer may come until then.
     pub(in crate::engine::bus) fn rest_until(&mut self, until: Time) {
         self.paused_until = self.paused_until.max(until);
