@@ -59,6 +59,12 @@ pub fn figures(
 ) -> Vec<Figure> {
     let rate = |reached: &Reached| reached.registers_per_second;
     let ratios = of_busker.iter().zip(of_libmodbus).map(|(ours, theirs)| rate(ours) / rate(theirs));
+    // How long a second of a processor is varies with the machine; the bare loop's varies with it.
+    let cpu_ratios = of_busker
+        .iter()
+        .zip(of_libmodbus)
+        .map(|(ours, theirs)| ours.cpu_per_million / theirs.cpu_per_million);
+    let cpu_ratio = median(&cpu_ratios.collect::<Vec<_>>());
     let half = |of: &[Reached], value: fn(&Reached) -> f64| {
         median(&of.iter().map(value).collect::<Vec<_>>()).unwrap_or_default()
     };
@@ -75,7 +81,10 @@ pub fn figures(
             .reached(ratios)
             .remark(remark),
         Figure::new(row, "CPU seconds per million registers, with MQTT", Target::AtMost(0.15), "")
-            .reached(of_busker.iter().map(|reached| reached.cpu_per_million)),
+            .reached(of_busker.iter().map(|reached| reached.cpu_per_million))
+            .remark(cpu_ratio.map_or_else(String::new, |ratio| {
+                format!("{ratio:.2} of the bare loop's, which publishes nothing")
+            })),
     ]
 }
 
