@@ -125,11 +125,14 @@ impl Pace {
             // It was the device itself that kept it waiting: that is not made up for. But where that is usual, what others
             // of its reads have had of its turns meanwhile is, so that the device stretches them alike.
             let of_device = of_device();
-            let usual = period.mul_f64(of_device.max(1.0));
-            let should_have_begun = due.before(period) + usual;
-            let is_usual =
-                of_device > Pace::BEHIND && self.time - should_have_begun <= usual * Pace::BEHIND_MOST;
-            return if is_usual { should_have_begun.min(self.time) } else { self.time };
+            if of_device > Pace::BEHIND {
+                let usual = period.mul_f64(of_device);
+                let should_have_begun = due.before(period) + usual;
+                if self.time - should_have_begun <= usual * Pace::BEHIND_MOST {
+                    return should_have_begun.min(self.time);
+                }
+            }
+            return self.time;
         }
         let until = self.time + self.owed;
         let ahead = due.min(until) - self.time;

@@ -154,7 +154,7 @@ pub struct Bus {
     /// Heartbeats and feedings of watchdogs in a row.
     fed_in_a_row: u32,
     pace: Pace,
-    /// Before, who has left something unanswered goes behind all others: see [`turns::SILENCES_IN_A_ROW`].
+    /// Before, who has left something unanswered goes behind all others.
     doubtful_from: Time,
     link_state: LinkState,
     connection: link::Connection,

@@ -25,10 +25,10 @@ pub const AHEAD_OF_READS: u32 = 8;
 const FED_IN_A_ROW: u32 = 8;
 
 /// Behind so many silences in a row the others have the line for as long as the last one took, if there is anything to ask
-/// them, before a device is asked again that has been silent already. Where half of a cabinet has lost its
-/// power each of its devices has to be asked three times in vain, and that may not be all that the line does meanwhile.
-/// (Behind each single one, a device on a disturbed line would be asked too seldom.)
-pub(super) const SILENCES_IN_A_ROW: u32 = 2;
+/// them, before a device is asked again that has been silent already. Where half of a cabinet has lost its power each of its
+/// devices has to be asked three times in vain, and that may not be all that the line does meanwhile. (Behind each single
+/// one, a device on a disturbed line would be asked too seldom.)
+const SILENCES_IN_A_ROW: u32 = 2;
 
 impl Bus {
     /// Asks what is to be asked next, if the line is free.
