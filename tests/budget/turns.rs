@@ -196,10 +196,10 @@ fn where_each_connection_is_closed_also_behind_a_silence_no_request_is_lost() {
     assert_eq!(line.lost, 0);
 }
 
-/// A part of a cabinet loses its power: each of its units is asked three times in vain, and the others have the line for
-/// as long in between.
+/// A part of a cabinet loses its power: each of its units is asked three times in vain, and the others have the line behind
+/// each two of these silences.
 #[test]
-fn where_many_die_at_once_the_others_are_asked_between_one_silence_and_the_next() {
+fn where_many_die_at_once_the_others_are_asked_between_their_silences() {
     for (fast, reads, count, dead) in [
         (10, 1, 10, 5),
         (10, 1, 20, 10),
@@ -221,24 +221,19 @@ fn where_many_die_at_once_the_others_are_asked_between_one_silence_and_the_next(
         let mut times = times(&mut line);
         let round = 0.037 * f64::from(reads) * count as f64;
         // Each of the dead may come first before it is known to be silent. It is waited for, the line is left alone for as
-        // long again, and the others have it for as long.
+        // long again, and the others may have it for as long.
         let most = dead as f64 * 3.0 * 0.5 + round.max(fast as f64 / 1e3);
         let what = format!("{dead} of {count} with {reads} reads each {fast} ms");
         for (read, period) in
             case.periods().into_iter().filter(|(read, _)| usize::from(read.0) <= count - dead)
         {
             let asked = times.remove(&read).unwrap_or_default();
-            let moments: Vec<Time> = [from].into_iter().chain(asked).chain([until]).collect();
-            let waits = moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64());
-            let longest = waits.fold(0.0, f64::max);
+            let longest = longest_wait(&asked, [from, until]);
             assert!(longest <= most, "{what}: {read:?} waited for {longest:.2} s, more than {most:.2} s");
             // Two such silences, and then half a second: a fifth of the time.
             let least = 60.0 / period.max(round) / 5.0;
-            assert!(
-                moments.len() as f64 >= least,
-                "{what}: {read:?} had {} turns, less than {least:.0}",
-                moments.len()
-            );
+            let turns = asked.len();
+            assert!(turns as f64 >= least, "{what}: {read:?} had {turns} turns, less than {least:.0}");
         }
     }
 }
@@ -545,6 +540,12 @@ fn times(line: &mut Plain) -> Times {
     times
 }
 
+/// In seconds, from one moment in which a read was asked to the next. One that is never asked has waited all the time.
+fn longest_wait(asked: &[Time], [from, until]: [Time; 2]) -> f64 {
+    let moments: Vec<Time> = [&[from], asked, &[until]].concat();
+    moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).fold(0.0, f64::max)
+}
+
 impl Case {
     /// Lets it befall the bus for so many milliseconds.
     fn perform(&self, line: &mut Plain, trouble: Trouble, lasts: u64) -> Result<(), String> {
@@ -664,17 +665,14 @@ impl Case {
         &self,
         seconds: f64,
         times: &Times,
-        [from, until]: [Time; 2],
+        span: [Time; 2],
         away: Option<u8>,
         cost: impl Fn(&Unit) -> f64,
     ) -> Result<(), String> {
         let load = self.load(&cost).max(1.0);
         let round: f64 = self.units.iter().map(|unit| unit.count() * cost(unit)).sum();
         for (read, period) in self.periods().into_iter().filter(|(read, _)| Some(read.0) != away) {
-            let asked = times.get(&read).into_iter().flatten().copied();
-            let moments: Vec<Time> = [from].into_iter().chain(asked).chain([until]).collect();
-            let longest =
-                moments.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64()).fold(0.0, f64::max);
+            let longest = longest_wait(times.get(&read).map_or(&[], Vec::as_slice), span);
             self.within(read, longest - seconds, period, load, round)?;
         }
         Ok(())
